@@ -324,7 +324,7 @@ def test_a_sparse_matrix_that_is_not_positive_is_refused(rng):
     assert SparseBlocks.of(grid.pattern, grid.free).factor(S) is None
 
 
-def test_few_threads_are_woken_for_little_work(rng, monkeypatch):
+def test_one_thread_does_little_work(rng, monkeypatch):
     grid, woken = Grid(rng), numba.get_num_threads()
     shape = SparseBlocks.of(grid.pattern, grid.free)
     with shape.threads():

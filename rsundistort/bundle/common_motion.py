@@ -93,7 +93,7 @@ class CommonMotion:
         What photos are expected to move by it, in the frames of their cameras: rotation and travel, in the same units;
         and its standard deviations.
     probability : float
-        How likely they share a motion.
+        How likely they share a motion, by these values; that of the prior is by those of the solve before.
     """
 
     values: Array

@@ -32,6 +32,7 @@ from ..model import Reconstruction
 from ..model.array_types import Array, Index
 from ..model.similarity import Similarity
 from .bundle_options import BundleOptions
+from .common_motion import MeansPrior
 from .layout import motion_end
 from .normal_equations import Function, NormalEquations
 
@@ -59,11 +60,11 @@ class Doubt:
     @classmethod
     def of(
         cls, equations: NormalEquations, options: BundleOptions, rec: Reconstruction, heavy: bool = True,
-        means: Array | None = None,
+        *, prior: MeansPrior | None = None, means: Array | None = None,
     ) -> Doubt:  # fmt: skip
         """At the solution that has these equations; NaN where the system cannot be factored.
 
-        `means` (cameras, k), the last unknowns of each camera, may be off by so much together.
+        The means (cameras, k), the last unknowns of each camera, if they have a prior.
         """
         cameras = rec.cameras
         c, names = equations.num_cameras, options.refine
@@ -73,8 +74,8 @@ class Doubt:
             of_each[:, each, each, : len(names)] = options.guessed.pulls_of_decentring(cameras, names, heavy)
         pulls = of_each.reshape(2 * c, -1)
         pulls = pulls[pulls.any(1)]
-        if means is not None and means.any():
-            pulls = np.vstack([pulls, _pull_of_means(equations, means)])
+        if prior is not None and means is not None and means.any():
+            pulls = np.vstack([pulls, _pull_of_means(equations, np.sqrt(prior.odds_against) * means)])
         unmoved = np.zeros((len(pulls), equations.num_photos, equations.blocks[1].shape[2]))
         photos, moved = equations.times(unmoved, pulls) if len(pulls) else (unmoved, pulls)
         if not options.rival:

@@ -44,9 +44,7 @@ class Posterior:
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)
         self._inflation = (result.inflation if plain.deviations == "jackknife" else 1.0) / result.noise_factor
-        prior = sigmas.means
-        unsure = None if prior is None else np.sqrt(prior.odds_against) * self._state.means
-        self._doubt = Doubt.of(self._equations, plain, rec, means=unsure)
+        self._doubt = Doubt.of(self._equations, plain, rec, prior=sigmas.means, means=self._state.means)
         self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
         self._shape = rec.num_images, self._equations.blocks[1].shape[2] - self._own

@@ -165,9 +165,9 @@ class Rounds:
         if state.path is not None:
             self._with_pace = equations.photos_by_shared(1)[:, :, 0]
         self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
-        prior = self._sigmas.means
-        unsure = None if prior is None else np.sqrt(prior.odds_against) * state.means
-        self._doubt = Doubt.of(equations, options, self._current, self._heavy_tails, unsure)
+        self._doubt = Doubt.of(
+            equations, options, self._current, self._heavy_tails, prior=self._sigmas.means, means=state.means
+        )  # fmt: skip
         self._inflation = Inflation()
         if asks_residuals:
             # the measurements of judged solves are the same, and their points hardly move
