@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from sift_like import sift_like
 
 from rsundistort import Camera
 from rsundistort.sfm.features import Features
-from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _matches, _with_likeliest_focal, seen_again
+from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _with_likeliest_focal, seen_again
 
 F = 500.0
 CAMERA = Camera(640, 360, [[F, 0, 320], [0, F, 180], [0, 0, 1]])
@@ -65,12 +66,12 @@ def seen(xy: NDArray[np.float64], descriptors: NDArray[np.uint8]) -> Features:
 
 def test_a_frame_after_a_cut_is_rotated_by_the_features_that_it_shows_again() -> None:
     rng = np.random.default_rng(1)
-    looks = rng.integers(0, 200, (120, 128)).astype(np.uint8)
+    looks = sift_like(rng.uniform(0, 200, (120, 128)))
     xy = rng.uniform([0, 0], [640, 360], (120, 2))
     rays = np.column_stack([(xy - [320, 180]) / F, np.ones(120)])
     turned = np.array([0.02, -0.15, 0.01])
     before, again = seen(xy, looks), pixels(rays, turned, np.zeros(3))
-    order, new = rng.permutation(120)[:70], rng.integers(0, 200, (50, 128)).astype(np.uint8)
+    order, new = rng.permutation(120)[:70], sift_like(rng.uniform(0, 200, (50, 128)))
     after = seen(
         np.concatenate([again[order], rng.uniform([0, 0], [640, 360], (50, 2))]), np.concatenate([looks[order], new])
     )
@@ -82,19 +83,8 @@ def test_a_frame_after_a_cut_is_rotated_by_the_features_that_it_shows_again() ->
     assert {*place.tolist()} == {*np.flatnonzero(np.isin(chosen, order)).tolist()}
     np.testing.assert_allclose(pixel, again[chosen[place]], atol=1e-9)
     # another scene shows none of them
-    other = replace(after, descriptors=rng.integers(0, 200, (120, 128)).astype(np.uint8))
+    other = replace(after, descriptors=sift_like(rng.uniform(0, 200, (120, 128))))
     assert seen_again(before, chosen, other, CAMERA) is None
-
-
-def test_matches_are_mutual_and_clear() -> None:
-    rng = np.random.default_rng(0)
-    first = rng.integers(0, 200, (20, 128)).astype(np.uint8)
-    # the last two look alike
-    first[19] = first[18]
-    a, b = _matches(first, first[::-1].copy())
-    assert a.tolist() == list(range(18))
-    assert (b == 19 - a).all()
-    assert not len(_matches(first[:1], first)[0])
 
 
 @pytest.mark.parametrize("guess", [300.0, 480.0, 700.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sift_like import sift_like
 
 from rsundistort import Camera, RowMotion, project_points
 from rsundistort.colmap.conventions import quiet_pycolmap
@@ -19,7 +20,7 @@ AHEAD, ASIDE = [0.02, 0.01, 0.3], [1.2, 0.4, 0.1]
 def pair(rng, tmp_path):
     """Two photos, the second from another place and with a motion; a fifth of their matches is wrong."""
     points_w = rng.uniform([-3, -2, 5], [3, 2, 12], (4000, 3))
-    descriptors = rng.integers(0, 90, (RIGHT + WRONG, 128)).astype(np.uint8)
+    descriptors = sift_like(rng.uniform(0, 90, (RIGHT + WRONG, 128)))
 
     def matched(phi, center=AHEAD, **options):
         shown = [

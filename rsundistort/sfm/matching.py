@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
 from ..model.array_types import Index
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
+from .descriptor_matches import match_descriptors
 from .epipolar import MIN_EXPLAINED, distance_from_planes, photo_pairs
 from .features import Features
 
@@ -61,17 +63,13 @@ def match_photos(
     pairs : (p, 2) int array, optional
         Pairs to match, as `choose_pairs` gives them; by default all.
     """
-    pycolmap = quiet_pycolmap()
     matched = MatchedPhotos(database, tuple(names), tuple(features), tuple(cameras), camera_idx, calibrated, seed)
-    with pycolmap.Database.open(database) as db:
+    with quiet_pycolmap().Database.open(database) as db:
         write_photos(db, matched)
         if not focal_known:
             for camera in db.read_all_cameras():
                 camera.has_prior_focal_length = False
                 db.update_camera(camera)
-        sift = pycolmap.FeatureExtractorType.SIFT
-        for index, found in enumerate(features):
-            db.write_descriptors(index + 1, pycolmap.FeatureDescriptors(type=sift, data=found.descriptors))
     match_more(matched, within_px=within_px, pairs=pairs)
     return matched
 
@@ -86,30 +84,24 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
     within_px, pairs
         As there.
     """
-    pycolmap, database = quiet_pycolmap(), matched.database
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
     close = close_px(matched.features)
-    verification = verification_options(min(within_px, close), matched.seed)
     before = _matched_pairs(matched)
-    if pairs is None:
-        pycolmap.match_exhaustive(database, matching, verification_options=verification, device=pycolmap.Device.cpu)
-    else:
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = _listed(matched, pairs)
-        pycolmap.match_image_pairs(
-            database, matching, pairing, verification_options=verification, device=pycolmap.Device.cpu
-        )
+    asked = combinations(range(len(matched.names)), 2) if pairs is None else np.sort(pairs, axis=1).tolist()
+    new = sorted({(first, second) for first, second in asked} - before)
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        for first, second in new:
+            found = match_descriptors(matched.features[first].descriptors, matched.features[second].descriptors)
+            db.write_matches(first + 1, second + 1, found)
+    _verify(matched, new, min(within_px, close))
     if close < within_px:  # with room for the shutter where the geometry without it loses matches
-        new = sorted(_matched_pairs(matched) - before)
-        with pycolmap.Database.open(database) as db:
+        with quiet_pycolmap().Database.open(matched.database) as db:
             lossy = [pair for pair in new if _loses_matches(db, *pair, close, within_px)]
-        _verify_anew(matched, lossy, within_px)
+        _verify(matched, lossy, within_px)
 
 
 def verify_loosely(matched: MatchedPhotos) -> None:
     """Verify all matches, by the keypoints of the database, with room for a shutter that is strong."""
-    _verify_anew(matched, sorted(_matched_pairs(matched)), LOOSE_PX)
+    _verify(matched, sorted(_matched_pairs(matched)), LOOSE_PX)
 
 
 def close_px(features: Sequence[Features]) -> float:
@@ -133,8 +125,8 @@ def _loses_matches(db: Any, first: int, second: int, close: float, within_px: fl
     return bool((distance_px <= close).sum() < _KEPT * (distance_px <= within_px).sum())
 
 
-def _verify_anew(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
-    """Verify pairs that have matches; the geometries that they had are forgotten."""
+def _verify(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
+    """Verify pairs that have matches; geometries that they had are forgotten."""
     if pairs:
         with quiet_pycolmap().Database.open(matched.database) as db:
             for first, second in pairs:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
@@ -16,6 +15,7 @@ from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
+from ..sfm.descriptor_matches import match_descriptors
 from ..sfm.features import Features
 from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
@@ -37,7 +37,7 @@ _SAMPLES, _FEW, _FAST, _AT_FIRST, _FITS = 100, 6, 0.1, 6.0, 10
 _MOST_OFF, _GRID, _ASKED = 2.0, 9, 6
 # Key frames before a cut that one after it may show again, its features that may, and how much nearer than the next one
 # a match is.
-_LAST, _MATCHED, _NEARER = 4, 2048, 0.8
+_LAST, _MATCHED = 4, 2048
 
 
 def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
@@ -146,7 +146,7 @@ def seen_again(
 
     None if too few agree on a rotation.
     """
-    first, second = _matches(before.descriptors[chosen], after.descriptors[:_MATCHED])
+    first, second = match_descriptors(before.descriptors[chosen], after.descriptors[:_MATCHED]).astype(np.int64).T
     xy, within = after.xy_raw[second], _ROOM_PX / float(camera.K[0, 0])
     own, seen = _directions(before.xy_raw[chosen[first]], camera), _directions(xy, camera)
     rotation = _agreed_rotation(own, seen, within)
@@ -154,21 +154,6 @@ def seen_again(
         return None
     agree = np.linalg.norm(own @ rotation.T - seen, axis=1) < within
     return rotation, first[agree], xy[agree]
-
-
-def _matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (n,) of descriptors that are each other's nearest, and nearer than the next one (Lowe 2004)."""
-    if len(first) < 2 or len(second) < 2:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    back = [each.trainIdx for each in matcher.match(second, first)]
-    clear = [
-        (best.queryIdx, best.trainIdx)
-        for best, next_best in matcher.knnMatch(first, second, k=2)
-        if best.distance < _NEARER * next_best.distance and back[best.trainIdx] == best.queryIdx
-    ]
-    index, nearest = np.array(clear, np.int64).reshape(-1, 2).T
-    return index, nearest
 
 
 def _joined(
