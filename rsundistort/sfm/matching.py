@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ import numpy as np
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
 from ..model.array_types import Index
+from .codebook import make_codebook
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
-from .descriptor_matches import match_descriptors
+from .descriptor_matches import DescriptorIndex, match_descriptors
 from .epipolar import MIN_EXPLAINED, distance_from_planes, photo_pairs
 from .features import Features
 
@@ -28,6 +30,10 @@ CLOSE_PX, LOOSE_PX = 4.0, 4.0 * LOOSE
 # distance. Wide epipolar lines have any direction where there is hardly any parallax: photos that follow each other
 # along a street come out in a wrong place by them, with the same matches.
 _KEPT = 0.95
+# Descriptors that the words are made of, and rounds of k-means: more miss no fewer matches.
+_SAMPLED, _ROUNDS = 8192, 4
+# Photos whose descriptors are kept sorted by words.
+_INDICES = 256
 
 
 def match_photos(
@@ -84,14 +90,16 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
     within_px, pairs
         As there.
     """
+    descriptors = [each.descriptors for each in matched.features]
+    words = make_codebook(descriptors, matched.seed, num_sampled=_SAMPLED, rounds=_ROUNDS)
+    index_of = lru_cache(_INDICES)(lambda photo: DescriptorIndex.of(descriptors[photo], words))
     close = close_px(matched.features)
     before = _matched_pairs(matched)
     asked = combinations(range(len(matched.names)), 2) if pairs is None else np.sort(pairs, axis=1).tolist()
     new = sorted({(first, second) for first, second in asked} - before)
     with quiet_pycolmap().Database.open(matched.database) as db:
         for first, second in new:
-            found = match_descriptors(matched.features[first].descriptors, matched.features[second].descriptors)
-            db.write_matches(first + 1, second + 1, found)
+            db.write_matches(first + 1, second + 1, match_descriptors(index_of(first), index_of(second)))
     _verify(matched, new, min(within_px, close))
     if close < within_px:  # with room for the shutter where the geometry without it loses matches
         with quiet_pycolmap().Database.open(matched.database) as db:

@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ..model.array_types import Array, Index
+from .codebook import STRONGEST, distance_from_words, make_codebook, sums_by_word
 
 __all__ = ["choose_pairs", "global_descriptors"]
 
-# words of the codebook, rounds of k-means, descriptors that it is made of, and features of a photo that count
-_WORDS, _ROUNDS, _SAMPLE, _STRONGEST = 256, 10, 32768, 2048
+# descriptors that the codebook is made of, and rounds of k-means
+_SAMPLED, _ROUNDS = 32768, 10
 # Length of a global descriptor. Sums of products of integers stay below its square, 2^24: float32 is exact to there.
 _LENGTH = 4000.0
 # partners in a sequence (on each side), by place and by similarity
@@ -139,46 +140,15 @@ def global_descriptors(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) 
     H. Jegou et al., Aggregating local image descriptors into compact codes, PAMI 2012; R. Arandjelovic, A. Zisserman,
     All about VLAD, CVPR 2013.
     """
-    words = _codebook(descriptors, seed)
+    words = make_codebook(descriptors, seed, num_sampled=_SAMPLED, rounds=_ROUNDS)
     if not len(words):
         return np.zeros((len(descriptors), 1), np.int16)
-    return np.array([_aggregated(each[:_STRONGEST].astype(np.float32), words) for each in descriptors])
-
-
-def _codebook(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.float32]:
-    """Words of integers by k-means over an equal share of each photo's descriptors."""
-    rng = np.random.default_rng(seed)
-    share = -(-_SAMPLE // max(1, len(descriptors)))
-    strongest = [each[:_STRONGEST] for each in descriptors]
-    sample = np.concatenate([each[rng.permutation(len(each))[:share]] for each in strongest]).astype(np.float32)
-    words = sample[rng.permutation(len(sample))[:_WORDS]]
-    for _ in range(_ROUNDS if len(words) else 0):
-        sums, counts = _sums(sample, _word_of(sample, words), len(words))
-        # a word that nothing is nearest to stays where it is
-        words = np.where(counts[:, None] > 0, np.rint(sums / np.maximum(counts, 1)[:, None]), words).astype(np.float32)
-    return words
-
-
-def _word_of(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.intp]:
-    """The nearest word of each descriptor; squares of 128 bytes stay below 2^24."""
-    return np.argmin((words**2).sum(1) - 2.0 * (descriptors @ words.T), axis=1)
-
-
-def _sums(descriptors: NDArray[np.float32], word: NDArray[np.intp], num_words: int) -> tuple[Array, Index]:
-    """Sum of the descriptors of each word, and how many there are."""
-    counts = np.bincount(word, minlength=num_words)
-    sums = np.zeros((num_words, descriptors.shape[1]))
-    present = np.flatnonzero(counts)
-    if len(present):
-        starts = np.cumsum(counts)[present] - counts[present]
-        order = np.argsort(word, kind="stable")
-        sums[present] = np.add.reduceat(descriptors[order].astype(np.float64), starts, axis=0)
-    return sums, counts
+    return np.array([_aggregated(each[:STRONGEST].astype(np.float32), words) for each in descriptors])
 
 
 def _aggregated(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int16]:
     """Sums of the residuals of a photo's descriptors by word: signed roots, of equal length by word, as one vector."""
-    sums, counts = _sums(descriptors, _word_of(descriptors, words), len(words))
+    sums, counts = sums_by_word(descriptors, distance_from_words(descriptors, words).argmin(axis=1), len(words))
     residuals = sums - counts[:, None] * words
     by_word = _unit(np.sign(residuals) * np.sqrt(np.abs(residuals)))
     return np.rint(_LENGTH * _unit(by_word.reshape(1, -1))[0]).astype(np.int16)

@@ -15,7 +15,7 @@ from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
-from ..sfm.descriptor_matches import match_descriptors
+from ..sfm.descriptor_matches import DescriptorIndex, match_descriptors
 from ..sfm.features import Features
 from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
@@ -146,7 +146,8 @@ def seen_again(
 
     None if too few agree on a rotation.
     """
-    first, second = match_descriptors(before.descriptors[chosen], after.descriptors[:_MATCHED]).astype(np.int64).T
+    looks = DescriptorIndex.of(before.descriptors[chosen]), DescriptorIndex.of(after.descriptors[:_MATCHED])
+    first, second = match_descriptors(*looks).astype(np.int64).T
     xy, within = after.xy_raw[second], _ROOM_PX / float(camera.K[0, 0])
     own, seen = _directions(before.xy_raw[chosen[first]], camera), _directions(xy, camera)
     rotation = _agreed_rotation(own, seen, within)
