@@ -59,8 +59,6 @@ def evaluate(
         without a reference are not compared, if any has one.
     raw : path, optional
         Folder of the photos that were rectified, for the figure before; `photos` beside the truth file.
-    progress : callable, optional
-        Called as (stage, done, total).
 
     Returns
     -------

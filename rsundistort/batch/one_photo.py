@@ -54,8 +54,6 @@ class PhotoJob:
         All that its remap grid takes.
     posed : bool
         Whether the photo has a pose, which no mirror image has.
-    options : RectifyOptions
-        See there.
     own_mask : Path, RemoteFile or None
         The user's mask of it.
     also : tuple of AlsoImage
@@ -148,8 +146,6 @@ class PhotoDone:
 
     Attributes
     ----------
-    name : str
-        Of the photo.
     problem : str
         Why it was left out; empty if it was not.
     fingerprint : str

@@ -53,8 +53,6 @@ class LengthResiduals:
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        Whose points are meant.
     lengths : sequence of KnownLength
         None, or two and more.
     """

@@ -71,8 +71,6 @@ class PlaceResiduals:
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        Whose photos and points are meant.
     known : KnownPlaces
         Fewer than three places hold no frame, and say nothing.
 

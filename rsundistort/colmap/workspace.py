@@ -40,8 +40,6 @@ def write_colmap_workspace(folder: Path, names: Sequence[str]) -> None:
 
     Parameters
     ----------
-    folder : Path
-        The workspace.
     names : sequence of str
         The photos of the model, by their ids.
     """

@@ -147,10 +147,6 @@ def common_motion(
     ----------
     result : BundleResult
         Of a model with a shutter.
-    options : BundleOptions, optional
-        Of the adjustment.
-    posterior : Posterior, optional
-        Of both, where it is at hand.
     """
     rec = result.reconstruction
     m, nb = result.covariances.shape[:2]

@@ -39,8 +39,6 @@ class CriticalMotion:
     y_axis_spread_deg : float
         Root mean square angle between the axes along which the photos were read out (y for rows, x for columns), taken
         as lines, and their mean line.
-    num_photos : int
-        Photos.
     """
 
     singular_values: NDArray[np.float64]

@@ -108,8 +108,6 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     ----------
     result : BundleResult
         Of a model with a shutter.
-    options : BundleOptions, optional
-        Of the adjustment.
     """
     rec = result.reconstruction
     m = rec.num_images

@@ -95,10 +95,6 @@ def experiment_two(
         Folders of photos with the same names, each pair taken from one place by one camera.
     out : path
         Folder for the outputs; it gets all of them or stays as it was.
-    options : TwoOptions, optional
-        See there.
-    progress : callable, optional
-        Called as (stage, done, total).
 
     Returns
     -------

@@ -57,8 +57,6 @@ class Clip:
 
     Attributes
     ----------
-    video : Path
-        The file.
     folder : Path
         Where its key frames lie, as PNG files.
     numbers : tuple of int, length n

@@ -207,8 +207,6 @@ def find_cameras(
 
     Parameters
     ----------
-    folder : Path
-        Of the photos.
     names, sizes, facts : sequences of length m
         Photos, their (width, height) and what their EXIF says.
     camera : str, optional

@@ -44,8 +44,6 @@ class PhotoPositions:
 
     Attributes
     ----------
-    names : list of str
-        The photos.
     geodetic : (m, 3) array
         Latitude and longitude in degrees, altitude in metres as in the photos.
     sigma_m : (m, 3) array
@@ -58,8 +56,6 @@ class PhotoPositions:
         From axes east, north and up to those of the camera, by its gimbal; NaN where unknown.
     sigma_from : tuple of str
         Source of the standard deviations.
-    notes : tuple of str
-        Remarks on them.
     common_up_m : float
         Standard deviation of an error that all altitudes share, which `sigma_m` does not contain.
     """
@@ -91,8 +87,6 @@ class MapFrame:
         Of "local" latitude, longitude and altitude; else what is subtracted from east, north and up.
     convergence_rad : float
         By how much east and north are rotated in the frame, counter-clockwise: a grid's north is not the north pole's.
-    note : str
-        A remark on it.
     """
 
     crs: str

@@ -31,19 +31,7 @@ _WEAK = 0.2
 
 
 def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kept | None = None) -> LoadedPhotos:
-    """The photos with focal lengths from their matches, where no other source gives them, and a note on that.
-
-    Parameters
-    ----------
-    photos : LoadedPhotos
-        Features and cameras.
-    seed : int
-        Seed of every random choice.
-    log : StageLog
-        Gets the progress.
-    kept : Kept, optional
-        Results of an earlier run; takes those of this run.
-    """
+    """The photos with focal lengths from their matches, where no other source gives them, and a note on that."""
     cameras, kept = photos.cameras, kept or Kept()
     if not cameras.without_focal:
         return photos

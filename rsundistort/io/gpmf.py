@@ -83,8 +83,6 @@ class GyroPayload:
         rad/s, in the order in which they are stored.
     orientation : (3, 3) array
         Takes `rates` to the camera's axes: right, down, ahead.
-    device : str
-        Name of the device.
     num_before : int or None
         Samples that the camera took before these (TSMP).
     stamp_s, frame_stamp_s : float or None

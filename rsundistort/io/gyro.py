@@ -289,8 +289,6 @@ def motions_from_gyro(
 
     Parameters
     ----------
-    log : GyroLog
-        Of the camera.
     times_s : mapping of photo name to float
         When the middle line of each photo was read, by the camera's clock.
     readout_s : float, or mapping of photo name to float
@@ -398,8 +396,6 @@ def gyro_offset(
 
     Parameters
     ----------
-    log : GyroLog
-        Of the camera.
     times_s : (m,) array
         When the middle lines of photos were read, by the camera's clock.
     phi_frame : (m, 3) array

@@ -342,8 +342,6 @@ def write_posed_photos(path: Path | str, posed: PosedPhotos, sensor_labels: Sequ
 
     Parameters
     ----------
-    path : Path or str
-        File to write.
     posed : PosedPhotos
         With the sensors of all its cameras.
     sensor_labels : sequence of str, optional

@@ -80,8 +80,6 @@ def write_transforms(
 
     Parameters
     ----------
-    path : Path
-        File to write.
     solution : Solution
         Poses and rectified cameras.
     files : mapping of photo name to (image path, mask path)

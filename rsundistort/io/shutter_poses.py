@@ -38,8 +38,6 @@ def write_shutter_poses(folder: Path, solution: Solution, photos: Mapping[str, s
 
     Parameters
     ----------
-    folder : Path
-        Where to write.
     solution : Solution
         In the stored frame: poses, motions, raw cameras, and in `quality["readout_times"]` what is known of these.
     photos : mapping of name to path

@@ -23,8 +23,6 @@ def write_trajectory(
 
     Parameters
     ----------
-    path : Path
-        File to write.
     times : (m,) array
         Timestamps.
     R_cw, center_w : (m, 3, 3), (m, 3) array
@@ -49,8 +47,6 @@ def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> Non
 
     Parameters
     ----------
-    path : Path
-        File to write.
     names : sequence of str, length m
         The frame of each moment.
     camera_path : CameraPath

@@ -77,8 +77,6 @@ def rectified_view(
         Of all of them: one camera has to do for all.
     shutter_model : str
         As in `init_rectify_map`.
-    view : ViewOptions
-        What is asked for.
     as_it_was : Camera
         The rectified camera where `view.alpha` is None.
     """

@@ -42,8 +42,6 @@ class DepthRows:
 
     Parameters
     ----------
-    depth : Depth
-        Of the photo.
     camera, motion
         Of the raw photo; the velocity in the camera frame.
     rays : (3, 3) array

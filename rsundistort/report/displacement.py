@@ -18,8 +18,6 @@ def displacement_field(
 
     Parameters
     ----------
-    solution : Solution
-        With the cameras.
     image : SolvedImage
         A registered photo.
     depth : float, optional

@@ -45,8 +45,6 @@ class FreedMatches:
     ----------
     matched : MatchedPhotos
         Keypoints of at least the reconstruction's photos.
-    reconstruction : Reconstruction
-        Poses, motions and cameras.
     """
 
     def __init__(self, matched: MatchedPhotos, reconstruction: Reconstruction) -> None:
@@ -174,8 +172,6 @@ def agreeing_photos(
     ----------
     matched, matches, num_verified
         Photos, their matches, and how many of these such a geometry fits.
-    reconstruction : Reconstruction
-        Poses and motions.
 
     Returns
     -------

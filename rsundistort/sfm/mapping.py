@@ -66,8 +66,6 @@ def map_photos(
 
     Parameters
     ----------
-    matched : MatchedPhotos
-        Photos with their matches.
     progress : callable, optional
         Called with the number of photos registered so far.
     keypoints : sequence of int or None

@@ -58,8 +58,6 @@ def match_photos(
     within_px : float
         Largest distance of verified matches from their epipolar lines, in the pixels of the photos. Pairs that lose
         few matches by that get the geometry of `CLOSE_PX`.
-    seed : int
-        Seed of the verification.
     pairs : (p, 2) int array, optional
         Pairs to match, as `choose_pairs` gives them; by default all.
     """

@@ -84,8 +84,6 @@ def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float =
         Points.
     xy_raw : (n, 2) array
         Where the photo shows them, pixels.
-    camera : Camera
-        Its camera.
     step_px : float
         Unit of the thresholds: pixels of this photo to one of the image that the features were found in.
 
@@ -219,8 +217,6 @@ def register_photos(
 
     Parameters
     ----------
-    matched : MatchedPhotos
-        Keypoints and matches.
     num_verified : mapping of (first, second) to int
         As `read_num_verified` returns them.
     scene : Reconstruction

@@ -180,8 +180,6 @@ def find_relative_pose(pair: Pair, phi_sigma: float) -> RelativePose | None:
 
     Parameters
     ----------
-    pair : Pair
-        Matches.
     phi_sigma : float
         Prior standard deviation of the components of phi, radians a frame.
 
@@ -206,8 +204,6 @@ def best_relative_pose(pair: Pair, phi_sigma: float, known: Sequence[RelativePos
 
     Parameters
     ----------
-    pair : Pair
-        Matches.
     phi_sigma : float
         Prior standard deviation of the components of phi, radians a frame.
     known : sequence of RelativePose, optional

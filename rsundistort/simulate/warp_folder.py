@@ -131,10 +131,6 @@ def simulate_warp(
     ----------
     photos, out : path
         Folder of photos taken without motion; folder for the outputs.
-    options : WarpOptions, optional
-        See there.
-    progress : callable, optional
-        Called as (stage, done, total).
 
     Returns
     -------

@@ -44,8 +44,6 @@ class FramePair:
     ----------
     camera : Camera
         Of both.
-    names : tuple of str
-        The frames.
     xy : (2, n, 2) array
         Pixels of the points that were followed from either to the other.
     """

@@ -141,12 +141,8 @@ def follow(
 
     Parameters
     ----------
-    clip : Clip
-        The video.
     shown : mapping of frame number to (n, 2) array
         Points of each key frame, pixels.
-    camera : Camera
-        Of the frames.
     worth : mapping of frame number to (n,) int array, optional
         Worth of the points: of those in the same part of a frame the best are followed; by default the first.
     most : int

@@ -87,16 +87,10 @@ def judged(
 
     Parameters
     ----------
-    found : FoundPath
-        The path.
-    keys : LoadedPhotos
-        The key frames.
     alone : ReadoutTime
         By the pictures, without a gyroscope.
     telemetry : GyroLog or None
         That of the video itself.
-    log : StageLog
-        Receives the progress.
     at_once : bool
         Whether the frames were read at once.
     """

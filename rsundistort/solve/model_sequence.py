@@ -91,18 +91,12 @@ def solve_photos(
 
     Parameters
     ----------
-    photos : LoadedPhotos
-        Features and cameras.
     shutter_model : str
         Last model of the sequence; "auto": up to rotation, then the model that best predicts held-out measurements.
-    seed : int
-        Seed of every random choice.
     options_of : callable
         Options of the adjustments for a reconstruction, whose cameras have their readout directions.
     scratch : Path
         Folder for the database.
-    log : StageLog
-        Gets the progress.
     remedy : str
         What to do about a critical motion, of `critical.REMEDIES`.
     matching : str
@@ -110,8 +104,6 @@ def solve_photos(
     workers : Workers, optional
         Workers that read the photos again, to align the tracks at full size; without them features keep their
         positions.
-    kept : Kept, optional
-        Results of an earlier run; takes those of this run.
     survey : Survey, optional
         Positions of photos and control points: the frame is then that of the map.
     finer : callable, optional

@@ -76,8 +76,6 @@ def measure_readout(
         Any file that FFmpeg decodes.
     options : RunOptions, optional
         `solve.readout_s` is a first guess, known to 2 %: a value that the video does not improve is not measured.
-    progress : callable, optional
-        Called as (stage, done, total).
     jobs : int
         Threads; 0 for all cores.
 

@@ -82,8 +82,6 @@ def solve_clip(
 
     Parameters
     ----------
-    clip : Clip
-        The video.
     keys : LoadedPhotos
         Its key frames, with their features.
     path : FramePath
@@ -92,8 +90,6 @@ def solve_clip(
         Options of the adjustments for a reconstruction.
     scratch : Path
         Folder for the database.
-    log : StageLog
-        Receives the progress.
     seed, matching
         As in `solve_photos`.
     gyroscope : GyroLog, optional
@@ -101,8 +97,6 @@ def solve_clip(
         are found.
     gyro_offset_s : float
         Where the offset of that log's clock is looked for, as `align_gyro` does around it.
-    kept : Kept, optional
-        Results of an earlier run; takes those of this run.
     at_once : bool
         Whether the frames were read at once, by a global shutter, or have lost their shutter since.
 

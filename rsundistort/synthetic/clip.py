@@ -129,10 +129,6 @@ class Clip:
 
     Parameters
     ----------
-    path : CameraPath
-        Of the camera.
-    num_frames : int
-        How many.
     fps : Fraction
         Frames a second.
     readout : float

@@ -42,8 +42,6 @@ def check_no_fold(name: str, camera: Camera, motion: RowMotion, depth: ArrayLike
 
     Parameters
     ----------
-    name : str
-        Photo, for the message.
     camera : Camera
         Its size, lens and readout.
     motion : RowMotion

@@ -94,14 +94,6 @@ class Recipe:
 
     Parameters
     ----------
-    name : str
-        Name of the recipe.
-    scene : Scene
-        What is there.
-    cameras : dict of id to Camera
-        What takes the photos.
-    views : tuple of View
-        The photos.
     render_options : dict
         Keyword arguments of `render_view`.
     jpeg_quality : int

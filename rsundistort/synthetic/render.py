@@ -33,8 +33,6 @@ def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[
     ----------
     camera : Camera
         Its readout says whether lines are rows or columns and which is read first.
-    view : View
-        Pose and motion.
     delay : float
         Time after the middle of the line's exposure, in units of the clock.
 
@@ -55,10 +53,6 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
 
     Parameters
     ----------
-    camera : Camera
-        Intrinsics, lens and readout.
-    view : View
-        Pose and motion.
     uv_raw : (n, 2) array
         Raw pixels; between lines the clock runs on.
 
@@ -106,10 +100,6 @@ def render_view(
 
     Parameters
     ----------
-    scene : Scene
-        What is there.
-    camera : Camera
-        Size, intrinsics, lens and readout.
     view : View
         Pose at mid-frame, motion and exposure: the samples of a pixel are spread over the exposure of its line.
     samples : int

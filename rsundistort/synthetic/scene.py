@@ -35,8 +35,6 @@ class Patch:
     ----------
     origin_w, edge_a_w, edge_b_w : (3,) array
         Corner, and the edges from it, in world metres.
-    texture : str
-        Name of a texture of the scene.
     offset_m : (float, float)
         Where on the texture the origin lies, metres along a and b.
     triangle : bool
@@ -286,8 +284,6 @@ class Scene:
         World metres, z up.
     textures : dict of str to Texture
         By the names that the patches use.
-    light : Light
-        Sun and sky.
     seed : int
         Of the textures and the clouds.
     """

@@ -77,8 +77,6 @@ def height_field(
         Extent along the world's x and y.
     heights_m : (rows, cols) array
         At the vertices of a regular grid, rows along y; at least 2 by 2.
-    texture : str
-        Name of a texture.
     """
     rows, cols = heights_m.shape
     if rows < 2 or cols < 2 or min(size_m) <= 0:
@@ -134,8 +132,6 @@ def mesh(
         World frame.
     faces : (k, 3) int array
         Counter-clockwise from the front. Triangles without area are left out.
-    texture : str
-        Name of a texture.
     uv_m : (n, 2) array, optional
         Where on the texture each vertex lies, metres. Without it the texture is laid on along the axis that each
         triangle faces most.

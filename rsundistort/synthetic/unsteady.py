@@ -156,8 +156,6 @@ def unsteady(
 
     Parameters
     ----------
-    name : str
-        Photo, for messages.
     camera : Camera
         Its clock and its size.
     steady : RowMotion, RowTable or function

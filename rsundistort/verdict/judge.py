@@ -109,8 +109,6 @@ def judge(
 
     Parameters
     ----------
-    result : BundleResult
-        The solution.
     global_result : BundleResult, optional
         A global-shutter adjustment of the same measurements, to compare a model that the user named with.
     choice : ModelChoice, optional

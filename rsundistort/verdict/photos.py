@@ -93,8 +93,6 @@ def hidden_px(result: BundleResult, options: BundleOptions) -> float:
     ----------
     result : BundleResult
         A solution without a shutter.
-    options : BundleOptions
-        Of its adjustment.
     """
     prior = options.phi_sigma or BundleOptions().phi_sigma_start
     wide = replace(options, phi_sigma=prior, loss="squared", outlier_rounds=0, sigma_px=result.sigma_px)

@@ -329,8 +329,6 @@ def write_image(
 
     Parameters
     ----------
-    path : Path
-        File to write.
     pixels, metadata
         As in `Photo`. JPEG and WebP hold 8 bits: 16-bit pixels are rounded to them. What the metadata says of the size
         is made true; its thumbnail, and what it says of other pictures that were in the file, is left out.
