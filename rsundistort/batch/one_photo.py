@@ -44,10 +44,6 @@ class PhotoJob:
     ----------
     name : str
         Of the photo, for people.
-    source : Path or RemoteFile
-        The raw photo.
-    out : Path or RemoteFolder
-        Folder of the outputs.
     image, mask : str
         Rectified photo and its mask, in `out`.
     geometry : PhotoGeometry
@@ -56,8 +52,6 @@ class PhotoJob:
         Whether the photo has a pose, which no mirror image has.
     own_mask : Path, RemoteFile or None
         The user's mask of it.
-    also : tuple of AlsoImage
-        Other images of its frame.
     maps : str or None
         Beginning of the names of the files of its grid, in `out`.
     sample_xy : (k, 2) int array or None

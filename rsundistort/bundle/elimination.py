@@ -32,8 +32,6 @@ class Elimination:
 
     Attributes
     ----------
-    structure : Structure
-        Which photo sees which point.
     free : (m, nb) bool array
         Unknowns that are not held.
     shape : Envelope or SparseBlocks

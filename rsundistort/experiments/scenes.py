@@ -26,10 +26,6 @@ class KnownScene:
 
     Attributes
     ----------
-    name : str
-        For files and figures.
-    camera : Camera
-        Of all photos.
     R_cw, center_w : (m, 3, 3), (m, 3) array
         Poses in the order of the sequence; the mean distance of consecutive centres is 1.
     points_w : (n, 3) array

@@ -47,11 +47,6 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
     figures : path
         Folder, made if missing; figures of the same names are replaced.
 
-    Returns
-    -------
-    list of Path
-        Written.
-
     Raises
     ------
     InputError

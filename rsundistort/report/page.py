@@ -54,11 +54,6 @@ def write_report(
     progress : callable, optional
         Called as (stage, done, total).
 
-    Returns
-    -------
-    Path
-        Of the report.
-
     Raises
     ------
     FileError, FormatError

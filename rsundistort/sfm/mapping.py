@@ -73,11 +73,6 @@ def map_photos(
     shown : MatchedPhotos, optional
         The photos as they are, where the keypoints of `matched` are not: their pixels are the measurements.
 
-    Returns
-    -------
-    Reconstruction
-        The photos that could be registered.
-
     Raises
     ------
     ReconstructionError

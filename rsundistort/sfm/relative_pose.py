@@ -70,8 +70,6 @@ class View:
         The clock's derivative by the pixel's x and y.
     frame_span : float
         How far the clock runs over the frame.
-    focal_px : float
-        Focal length in pixels.
     """
 
     rays: Array

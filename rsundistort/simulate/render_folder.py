@@ -78,11 +78,6 @@ def simulate_scene(
     out : path
         Folder for the outputs; it gets all of them or stays as it was.
 
-    Returns
-    -------
-    Solution
-        The truth.
-
     Raises
     ------
     InputError

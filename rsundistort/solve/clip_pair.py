@@ -42,8 +42,6 @@ class FramePair:
 
     Attributes
     ----------
-    camera : Camera
-        Of both.
     xy : (2, n, 2) array
         Pixels of the points that were followed from either to the other.
     """

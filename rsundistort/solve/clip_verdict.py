@@ -48,8 +48,6 @@ class FoundPath:
         With the times that the path has.
     result : BundleResult
         Of all frames.
-    options : BundleOptions
-        Those of the adjustment.
     filmed : Stabilisation, optional
         Whether the frames are as the sensor read them, if that was tested.
     felt : Felt, optional
