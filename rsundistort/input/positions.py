@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io import ExifFacts
 from ..io.photos.gps import ALTITUDES
+from ..model.array_types import Array
 from ..model.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic
 
 __all__ = ["MapFrame", "PhotoPositions", "check_crs", "frame_at", "frame_of_control", "positions_of"]
-
-Array = NDArray[np.float64]
 
 # Altitudes of one photo that differ by more are of two datums, metres.
 _ANOTHER_DATUM_M = 1.0

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError
 from ..model import Camera, Solution
+from ..model.array_types import Array
 from .json_text import read_json
 from .rules import Numbers, check
 
@@ -46,7 +46,7 @@ def intrinsics(camera: Camera) -> dict[str, Any]:
     return value | {name: lens[name] for name in ("k1", "k2", "p1", "p2")} | ({"k3": lens["k3"]} if lens["k3"] else {})
 
 
-def camera_to_world(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> list[list[float]]:
+def camera_to_world(R_cw: Array, center_w: Array) -> list[list[float]]:
     """The (4, 4) `transform_matrix` of a pose."""
     matrix = np.eye(4)
     # OpenCV looks along +z with y down, OpenGL along -z with y up
@@ -56,7 +56,7 @@ def camera_to_world(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) ->
     return found
 
 
-def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_transforms(path: Path) -> tuple[Array, Array]:
     """Poses R_cw (m, 3, 3) and center_w (m, 3) of a `transforms.json`."""
     value = read_json(path)
     try:

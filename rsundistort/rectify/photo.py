@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .._kernels import maps as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion, check_shutter_model
+from ..model.array_types import Array
 from ..model.checks import check_kind, check_one_of, check_whole
 from ..model.depth import check_depth
 from ..model.projection import motion_of
@@ -151,7 +152,7 @@ def _fill_rows(
     camera: Camera,
     motion: RowMotion,
     shutter_model: str,
-    rays: NDArray[np.float64],
+    rays: Array,
     size: tuple[int, int],
     depth: Depth,
 ) -> FillRows:

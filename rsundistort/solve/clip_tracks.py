@@ -7,11 +7,11 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..input.key_frames import Clip, flow_frames_of
 from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.array_types import Array, Index
 from ..model.projection import unproject_points
 from ..sfm.flow import FlowFrame, flow_between
 from ..sfm.resection import resect
@@ -38,12 +38,12 @@ class Followed:
         Pixels.
     """
 
-    def __init__(self, chosen: Mapping[int, NDArray[np.int64]]) -> None:
+    def __init__(self, chosen: Mapping[int, Index]) -> None:
         self.chosen = chosen
         self.frame = self.key = self.place = np.zeros(0, np.int64)
         self.xy_raw = np.zeros((0, 2))
 
-    def of(self, chosen: Mapping[int, NDArray[np.int64]]) -> Followed:
+    def of(self, chosen: Mapping[int, Index]) -> Followed:
         """The same places, by other indices (n,) of the keys' measurements; without points of which it is negative."""
         anew = Followed({key: index[index >= 0] for key, index in chosen.items()})
         place = {key: np.where(index >= 0, np.cumsum(index >= 0) - 1, -1) for key, index in chosen.items()}
@@ -53,7 +53,7 @@ class Followed:
         anew.xy_raw = self.xy_raw[there]
         return anew
 
-    def add(self, found: list[tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]) -> None:
+    def add(self, found: list[tuple[int, Index, Index, Array]]) -> None:
         """The places found of keys' points: key, frames (o,), places (o,) and pixels (o, 2) of each."""
         if not found:
             return
@@ -61,7 +61,7 @@ class Followed:
         self.frame, self.place, self.xy_raw = (np.concatenate(part) for part in parts)
         self.key = np.repeat(np.array(keys, np.int64), [len(frame) for frame in parts[0]])
 
-    def add_more(self, key: int, frame: int, place: NDArray[np.int64], xy_raw: NDArray[np.float64]) -> None:
+    def add_more(self, key: int, frame: int, place: Index, xy_raw: Array) -> None:
         """Places (n,) of a key's points at pixels (n, 2) of one more frame."""
         self.frame = np.concatenate([self.frame, np.full(len(place), frame)])
         self.key = np.concatenate([self.key, np.full(len(place), key)])
@@ -69,9 +69,7 @@ class Followed:
         self.xy_raw = np.concatenate([self.xy_raw, xy_raw])
 
 
-def _spread(
-    xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, int], most: int
-) -> NDArray[np.int64]:  # fmt: skip
+def _spread(xy: Array, worth: Index, size: tuple[int, int], most: int) -> Index:
     """Indices of the points (n, 2) that are followed: the best of each cell of the frame, then the next best."""
     cell = np.clip(_CELLS * (xy + 0.5) / size, 0, _CELLS - 1).astype(int) @ [1, _CELLS]
     order = np.lexsort((-worth, cell))
@@ -111,9 +109,7 @@ def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
     return followed
 
 
-def followed_again(
-    clip: Clip, followed: Followed, before: Reconstruction, reconstruction: Reconstruction
-) -> Followed:  # fmt: skip
+def followed_again(clip: Clip, followed: Followed, before: Reconstruction, reconstruction: Reconstruction) -> Followed:
     """What was followed of a reconstruction's points, of another one's: of features that both measure."""
     mine, chosen = _of_keys(clip, reconstruction), {}
     for key, starts in followed.chosen.items():
@@ -124,7 +120,7 @@ def followed_again(
     return followed.of(chosen)
 
 
-def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, NDArray[np.int64]]:
+def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, Index]:
     """The measurements of each key frame, by its number."""
     number = {name: k for k, name in enumerate(clip.names)}
     return {
@@ -134,8 +130,8 @@ def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, NDArray[np.int64]]:
 
 
 def follow(
-    clip: Clip, shown: Mapping[int, NDArray[np.float64]], camera: Camera,
-    worth: Mapping[int, NDArray[np.int64]] | None = None, most: int = _POINTS,
+    clip: Clip, shown: Mapping[int, Array], camera: Camera,
+    worth: Mapping[int, Index] | None = None, most: int = _POINTS,
 ) -> Followed:  # fmt: skip
     """Follow points of key frames to the key frames before and after.
 
@@ -168,11 +164,11 @@ def follow(
 class CameraPoses:
     """Poses between those of some frames of a clip."""
 
-    def __init__(self, clip: Clip, poses: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]]) -> None:
+    def __init__(self, clip: Clip, poses: Mapping[int, tuple[Array, Array]]) -> None:
         self._clip, self._poses = clip, dict(poses)
         self._frames = np.array(sorted(poses))
 
-    def near(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def near(self, frame: int) -> tuple[Array, Array]:
         """A steady motion's pose between the two frames around one, or that of the only neighbour in its part."""
         part = self._clip.part
         after = int(np.searchsorted(self._frames, frame))

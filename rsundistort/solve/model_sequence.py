@@ -109,9 +109,7 @@ def solve_photos(
     finer : callable, optional
         As in `place_photos`.
     """
-    mapped, matched = place_photos(
-        photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer
-    )  # fmt: skip
+    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer)
     check_enough(mapped, len(photos.names))
     num_verified = read_num_verified(matched)
     source = TrackSource(matched, photos, workers, mapped_here=True)
@@ -191,9 +189,7 @@ def solve_tracks(
     log.begin("verdict")
     measured = mapped if track_source is None else tracks
     suspects = [] if registrar is None else registrar.suspects(result.reconstruction)
-    verdict = judge(
-        result, global_result, choice, mended, measured, options, strong, suspects, survey is not None
-    )  # fmt: skip
+    verdict = judge(result, global_result, choice, mended, measured, options, strong, suspects, survey is not None)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)

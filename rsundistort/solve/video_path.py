@@ -190,9 +190,7 @@ def _with_gyroscope(
     result, options, felt = found.result, found.options, felt_gyroscope(found.result, gyroscope, around_s)
     if felt is not None:
         # its rates are those of the camera, however fast that shakes
-        path = replace(
-            found.path, rates=felt.rates(result), start=result.path_start(), readout=known, held_sigma=0.0
-        )  # fmt: skip
+        path = replace(found.path, rates=felt.rates(result), start=result.path_start(), readout=known, held_sigma=0.0)
         options = replace(options, path=path)
         result = bundle_adjust(
             result.reconstruction, "constant-motion",

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError
 from ..io.json_text import read_json
+from ..model.array_types import Array
 from ..model.camera import Camera
 from ..model.checks import check_finite, check_rotations, check_whole, frozen
 from ..model.motion import RowMotion
@@ -53,8 +53,8 @@ class View:
     """
 
     name: str
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
+    R_cw: Array
+    center_w: Array
     motion: RowMotion
     camera_id: str = "1"
     exposure: float = 0.0

@@ -7,10 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import FileError, FormatError, InputError
+from ..model.array_types import Array, Index
 from ..model.checks import check_array, check_finite
 from .entries import count, kind_of, number, take
 from .scene import Opening, Patch, box, wall
@@ -64,9 +64,7 @@ def _flat(entry: Any, where: str, kind: str) -> list[Patch]:
     return wall(patch, openings)
 
 
-def height_field(
-    origin_w: NDArray[np.float64], size_m: NDArray[np.float64], heights_m: NDArray[np.float64], texture: str
-) -> list[Patch]:
+def height_field(origin_w: Array, size_m: Array, heights_m: Array, texture: str) -> list[Patch]:
     """Triangles of a ground of uneven height, its texture laid on from above.
 
     Parameters
@@ -119,10 +117,10 @@ def _height_field(entry: Any, where: str, rng: np.random.Generator) -> list[Patc
 
 
 def mesh(
-    vertices_w: NDArray[np.float64],
-    faces: NDArray[np.int64],
+    vertices_w: Array,
+    faces: Index,
     texture: str,
-    uv_m: NDArray[np.float64] | None = None,
+    uv_m: Array | None = None,
 ) -> list[Patch]:
     """Patches of a triangle mesh.
 
