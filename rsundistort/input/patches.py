@@ -52,9 +52,7 @@ def patch_source(
     most = max(camera.width * camera.height for camera in photos.cameras.cameras)
     fitting = workers.fitting("alignment", _BYTES_PER_PIXEL * most)
 
-    def patches_of(
-        places: Mapping[int, PatchPlaces],
-    ) -> Iterator[tuple[int, NDArray[np.uint8], Mask]]:
+    def patches_of(places: Mapping[int, PatchPlaces]) -> Iterator[tuple[int, NDArray[np.uint8], Mask]]:
         jobs = [
             _PatchJob(
                 frame, photos.folder / names[frame], photos.mask_of.get(names[frame]), photos.max_megapixels, each

@@ -12,15 +12,7 @@ import numpy as np
 from ..bundle import BundleOptions, GuessedCameras, deviation, pixels_of
 from ..bundle.intrinsics import check_lenses
 from ..errors import InputError, ReconstructionError
-from ..io import (
-    CameraFile,
-    ExifFacts,
-    camera_from_exif,
-    check_camera_fits,
-    group_of,
-    guess_readouts,
-    read_camera_file,
-)
+from ..io import CameraFile, ExifFacts, camera_from_exif, check_camera_fits, group_of, guess_readouts, read_camera_file
 from ..model import Camera, check_readout
 from ..model.array_types import Index
 from ..sfm import USUAL_FOCAL

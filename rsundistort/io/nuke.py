@@ -59,13 +59,7 @@ def _lens(camera: Camera) -> list[float]:
     return [float(fx * mm), FILM_WIDTH, float(camera.height * mm * fx / fy), float(u), float(v), float(ratio)]
 
 
-def _script(
-    frames: Index,
-    centers: Array,
-    angles: Array,
-    lens: Array,
-    cameras: Sequence[Camera],
-) -> str:
+def _script(frames: Index, centers: Array, angles: Array, lens: Array, cameras: Sequence[Camera]) -> str:
     def curve(values: Array) -> str:
         if np.ptp(values) == 0:
             return repr(float(values[0]))

@@ -121,13 +121,7 @@ def plane_in_camera(normal_w: Array, offset: float, R_cw: Array, center_w: Array
     return Plane(R_cw @ normal_w * np.sign(distance), abs(distance))
 
 
-def prefers_plane(
-    plane: Plane,
-    xy: Array,
-    rays_c: Array,
-    depth: Array,
-    size: tuple[int, int],
-) -> bool:
+def prefers_plane(plane: Plane, xy: Array, rays_c: Array, depth: Array, size: tuple[int, int]) -> bool:
     """Whether a plane predicts the depths of half of the points at least as well as a map of the other half does.
 
     Parameters

@@ -116,12 +116,7 @@ def _height_field(entry: Any, where: str, rng: np.random.Generator) -> list[Patc
     return height_field(origin, size, heights, entry["texture"])
 
 
-def mesh(
-    vertices_w: Array,
-    faces: Index,
-    texture: str,
-    uv_m: Array | None = None,
-) -> list[Patch]:
+def mesh(vertices_w: Array, faces: Index, texture: str, uv_m: Array | None = None) -> list[Patch]:
     """Patches of a triangle mesh.
 
     Parameters
