@@ -14,14 +14,7 @@ from ..model.array_types import Array
 from ..model.projection import project_points
 from .conventions import HALF, import_pycolmap
 
-__all__ = [
-    "FIT_PX",
-    "camera_from_colmap",
-    "camera_to_colmap",
-    "nearest_camera",
-    "pinhole_to_colmap",
-    "refined_camera",
-]
+__all__ = ["FIT_PX", "camera_from_colmap", "camera_to_colmap", "nearest_camera", "pinhole_to_colmap", "refined_camera"]
 
 # COLMAP's camera models that are ours with some of the coefficients zero: the lens, the number of coefficients
 _LENSES = {

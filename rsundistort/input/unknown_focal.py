@@ -40,9 +40,7 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
     found = {k: before.get(str(k)) or _focal_length(photos, k, seed) for k in cameras.without_focal}
     kept.put("focal lengths", {str(k): each for k, each in found.items()})
     log.end(
-        "focal length",
-        pixels=[each.pixels for each in found.values()],
-        sigma=[each.sigma for each in found.values()],
+        "focal length", pixels=[each.pixels for each in found.values()], sigma=[each.sigma for each in found.values()]
     )
     new, sigma, said = list(cameras.cameras), [dict(each) for each in cameras.sigma], []
     for k, focal in found.items():

@@ -382,12 +382,7 @@ def bends_from_gyro(
 
 
 def gyro_offset(
-    log: GyroLog,
-    times_s: ArrayLike,
-    phi_frame: ArrayLike,
-    readout_s: float,
-    *,
-    largest_s: float = 10.0,
+    log: GyroLog, times_s: ArrayLike, phi_frame: ArrayLike, readout_s: float, *, largest_s: float = 10.0
 ) -> tuple[float, float]:
     """The offset of a log's clock, from motions that were solved for without it.
 

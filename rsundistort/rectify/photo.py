@@ -149,12 +149,7 @@ FillRows = Callable[[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.u
 
 
 def _fill_rows(
-    camera: Camera,
-    motion: RowMotion,
-    shutter_model: str,
-    rays: Array,
-    size: tuple[int, int],
-    depth: Depth,
+    camera: Camera, motion: RowMotion, shutter_model: str, rays: Array, size: tuple[int, int], depth: Depth
 ) -> FillRows:
     """What fills the rows of the map of a photo of `size`: interpolated, but exact where depths make it rough."""
     depth_rows = DepthRows(depth, camera, motion, rays, size)

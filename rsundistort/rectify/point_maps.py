@@ -67,12 +67,7 @@ def _checked(
 
 
 def _rectified(
-    xy: Array,
-    camera: Camera,
-    motion: RowMotion,
-    shutter_model: str,
-    rays: Array,
-    depth: Depth | ArrayLike,
+    xy: Array, camera: Camera, motion: RowMotion, shutter_model: str, rays: Array, depth: Depth | ArrayLike
 ) -> Array:
     """Rectified pixels (n, 2) of raw pixels; rays (3, 3) as of `rectified_rays`."""
     ideal, _ = unproject_points(xy, camera, motion, shutter_model)

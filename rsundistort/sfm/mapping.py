@@ -155,9 +155,7 @@ def _largest(models: Iterable[Any]) -> Any:
 
 
 def _best_model(
-    matched: MatchedPhotos,
-    attempts: Sequence[tuple[int | None, float]],
-    progress: Callable[[int], None] | None,
+    matched: MatchedPhotos, attempts: Sequence[tuple[int | None, float]], progress: Callable[[int], None] | None
 ) -> Any:
     """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None.
 

@@ -59,11 +59,7 @@ class MeasuredReadout:
 
 
 def measure_readout(
-    video: Path | str,
-    options: RunOptions | None = None,
-    progress: ProgressCallback | None = None,
-    *,
-    jobs: int = 0,
+    video: Path | str, options: RunOptions | None = None, progress: ProgressCallback | None = None, *, jobs: int = 0
 ) -> MeasuredReadout:
     """Measure the readout time of a camera from a video that it took; nothing is written.
 

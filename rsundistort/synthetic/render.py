@@ -89,13 +89,7 @@ def _footprint(num: int, spread_px: float) -> Array:
 
 
 def render_view(
-    scene: Scene,
-    camera: Camera,
-    view: View,
-    *,
-    samples: int = 16,
-    spread_px: float = 0.6,
-    exposure: float = 1.0,
+    scene: Scene, camera: Camera, view: View, *, samples: int = 16, spread_px: float = 0.6, exposure: float = 1.0
 ) -> NDArray[np.uint8]:
     """The photo that a camera takes of a scene.
 

@@ -134,12 +134,7 @@ def wall(patch: Patch, openings: list[Opening]) -> list[Patch]:
 
 
 def box(
-    center_w: ArrayLike,
-    size_m: ArrayLike,
-    texture: str,
-    yaw_deg: float = 0.0,
-    top: str = "",
-    offset_m: Any = None,
+    center_w: ArrayLike, size_m: ArrayLike, texture: str, yaw_deg: float = 0.0, top: str = "", offset_m: Any = None
 ) -> list[Patch]:
     """The six sides of a box that stands at center_w (of its foot), rotated about the vertical.
 
@@ -224,8 +219,7 @@ def _sky_image(light: Light, seed: int) -> NDArray[np.float32]:
     polar = (np.arange(rows) + 0.5)[:, None] / rows * np.pi / 2
     azimuth = ((np.arange(cols) + 0.5)[None, :] / cols - 0.5) * 2 * np.pi
     direction = np.stack(
-        np.broadcast_arrays(np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)),
-        -1,
+        np.broadcast_arrays(np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)), -1
     )
     low = (1 - direction[..., 2]) ** 2.2
     blue, pale = np.array([0.24, 0.42, 0.82]), np.array([0.78, 0.86, 0.95])

@@ -175,10 +175,7 @@ def judge(
 
 
 def _verdict(
-    shutter: str,
-    reasons: list[str],
-    doubtful: Mapping[str, str] | None = None,
-    lens_only: tuple[str, ...] = (),
+    shutter: str, reasons: list[str], doubtful: Mapping[str, str] | None = None, lens_only: tuple[str, ...] = ()
 ) -> Verdict:
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), doubtful or {}, lens_only)
 

@@ -319,11 +319,7 @@ def _encode_params(kind: str, quality: int, flat: bool) -> list[int]:
 
 
 def write_image(
-    path: Path,
-    pixels: NDArray[Any],
-    metadata: Metadata | None = None,
-    quality: int = 95,
-    flat: bool = False,
+    path: Path, pixels: NDArray[Any], metadata: Metadata | None = None, quality: int = 95, flat: bool = False
 ) -> None:
     """Write an image of the kind that the path's ending says, whole or not at all.
 
