@@ -68,8 +68,6 @@ def rectify_photos(
 
     Parameters
     ----------
-    folder, scene, names
-        Of the raw photos, their geometry, and which of them.
     out : Path or RemoteFolder
         `batch_folder` made it ready, and gave `journal`.
     options, workers, log, journal

@@ -20,8 +20,6 @@ class Posterior:
 
     Parameters
     ----------
-    result : BundleResult
-        Where.
     options : BundleOptions, optional
         Those of the adjustment: constraints, known motions and refined intrinsics count.
     """

@@ -35,8 +35,6 @@ class ShapeCost:
         the largest variance, other than motions of the world. Rotations and phi in radians, lengths in baselines.
     weakest_share : float
         Share of the vertical scale in that mode: square of the correlation of the two, 0 to 1.
-    common : CommonMotion
-        Uncertainty of the part of the motions that the photos share.
     """
 
     sigma_log_k: float

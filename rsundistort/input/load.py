@@ -57,8 +57,6 @@ class LoadedPhotos:
         Unreadable ones.
     orientations : mapping of name to int
         Their EXIF orientations.
-    folder : Path
-        Where they are.
     max_megapixels : float
         As in `RectifyOptions`.
     edges_px : sequence of float or None

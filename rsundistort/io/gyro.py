@@ -392,8 +392,6 @@ def gyro_offset(
         When the middle lines of photos were read, by the camera's clock.
     phi_frame : (m, 3) array
         Their rotations in radians per frame: `image.motion.phi * camera.frame_span` of a solution.
-    readout_s : float
-        Time of the readout of a frame.
     largest_s : float
         Offsets of either sign up to this are tried.
 

@@ -45,8 +45,6 @@ def project_rows(
         Pose that the motion belongs to.
     motion : RowMotion
         Motion during the readout, with its bend.
-    camera : Camera
-        Intrinsics, lens and readout direction.
 
     Returns
     -------

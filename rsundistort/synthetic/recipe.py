@@ -44,8 +44,6 @@ class View:
         World to camera at the line of the principal point; of a motion with a bend the pose of the nearest steady one.
     center_w : (3,) array
         Centre of the camera then, world units.
-    motion : RowMotion
-        Motion during the readout.
     camera_id : str
         Which of the recipe's cameras took it.
     exposure : float

@@ -156,8 +156,6 @@ def unsteady(
 
     Parameters
     ----------
-    camera : Camera
-        Its clock and its size.
     steady : RowMotion, RowTable or function
         The motion without the following; functions give rotation vectors and positions (k, 3) at values (k,) of the
         clock.

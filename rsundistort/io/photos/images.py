@@ -84,8 +84,6 @@ class Photo:
     ----------
     pixels : (h, w) or (h, w, 3 | 4) array
         uint8, uint16 or float32 in OpenCV's channel order (BGR), in the stored frame.
-    metadata : Metadata
-        EXIF, XMP and ICC.
     """
 
     pixels: NDArray[Any]
