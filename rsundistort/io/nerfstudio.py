@@ -14,6 +14,7 @@ from ..model import Camera, Solution
 from ..model.array_types import Array
 from .json_text import read_json
 from .rules import Numbers, check
+from .usd import FLIP
 
 __all__ = ["read_transforms", "write_transforms"]
 
@@ -50,7 +51,7 @@ def camera_to_world(R_cw: Array, center_w: Array) -> list[list[float]]:
     """The (4, 4) `transform_matrix` of a pose."""
     matrix = np.eye(4)
     # OpenCV looks along +z with y down, OpenGL along -z with y up
-    matrix[:3, :3] = R_cw.T @ np.diag([1.0, -1.0, -1.0])
+    matrix[:3, :3] = R_cw.T @ FLIP
     matrix[:3, 3] = center_w
     found: list[list[float]] = matrix.tolist()
     return found
@@ -65,7 +66,7 @@ def read_transforms(path: Path) -> tuple[Array, Array]:
         raise FormatError(f"{path} is no transforms.json: {error}") from error
     matrices = np.array([frame["transform_matrix"] for frame in value["frames"]], np.float64).reshape(-1, 4, 4)
     # back from OpenGL's axes; a matrix may hold a scale
-    axes = matrices[:, :3, :3] @ np.diag([1.0, -1.0, -1.0])
+    axes = matrices[:, :3, :3] @ FLIP
     with np.errstate(over="ignore"):
         length = np.linalg.norm(axes, axis=1, keepdims=True)
     if not ((length > 0) & np.isfinite(length)).all():

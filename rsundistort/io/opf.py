@@ -30,10 +30,10 @@ from ..model import Camera, Observations, Reconstruction, Solution, SolvedImage
 from ..model.array_types import Array, Index
 from .export_scene import ExportScene, euler_deg, lens_left_px, rotation_left_px
 from .photos.exif_facts import ExifFacts, read_exif
+from .usd import FLIP
 
 __all__ = ["opf_model", "write_opf", "write_rectified_opf"]
 
-_FLIP = np.diag([1.0, -1.0, -1.0])
 # glTF has y up, OPF z: what its own converter undoes.
 _GLTF = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 # Errors of a lens that are not worth a word.
@@ -136,7 +136,7 @@ def _write(
         captures.append(_capture(Uid64(int=1 + k), sensor_id[image.camera_id], facts))
         assert image.R_cw is not None
         R_cw, center_w, way = _middle(solution, image) if rolling else (image.R_cw, image.center_w, None)
-        angles = euler_deg(R_cw.T @ _FLIP, "XYZ")
+        angles = euler_deg(R_cw.T @ FLIP, "XYZ")
         calibrated.append(opf.CalibratedCamera(ids[image.name], sensor_id[image.camera_id], angles, center_w, way))
     types = CoreProjectItemType
 
@@ -296,7 +296,7 @@ def _model(project: Any, where: str) -> ColmapModel:
     cameras = [_camera(s.internals, sizes[s.id.int], f"{where}: sensor {s.id.int}") for s in found.sensors]
     place = {camera.id.int: k for k, camera in enumerate(found.cameras)}
     names = [checked_name(files[camera.id.int], where) for camera in found.cameras]
-    R_wc = Rotation.from_euler("XYZ", [c.orientation_deg for c in found.cameras], degrees=True).as_matrix() @ _FLIP
+    R_wc = Rotation.from_euler("XYZ", [c.orientation_deg for c in found.cameras], degrees=True).as_matrix() @ FLIP
     node = calibration.tracks.nodes[0]
     matches = node.matches
     if matches is None or matches.image_points is None:
