@@ -160,8 +160,9 @@ def align_gyro(
         return NoAlignment("the camera, or its gyroscope, did not move at all")
     found = coarse.search(largest_s, around_s)
     if found is None:
+        within = f"within {largest_s:g} s of {around_s:g} s" if around_s else f"up to {largest_s:g} s"
         return NoAlignment(
-            f"no offset {_up_to(largest_s, around_s)} lets the gyroscope's log, from {log.time_s[0]:.2f} to "
+            f"no offset {within} lets the gyroscope's log, from {log.time_s[0]:.2f} to "
             f"{log.time_s[-1]:.2f} s, cover the frames"
         )
     offset, proper, mirrored, rival = found
@@ -222,10 +223,6 @@ def _why_not(fit: GyroAlignment, way: Array, spread: float, interval_s: float) -
     if not fit.offset_sigma_s < interval_s / 2:
         return "the camera rotated too uniformly to determine the offset of the gyroscope's clock"
     return None
-
-
-def _up_to(largest_s: float, around_s: float) -> str:
-    return f"within {largest_s:g} s of {around_s:g} s" if around_s else f"up to {largest_s:g} s"
 
 
 def _other_clip(correlation: float) -> str:
