@@ -55,8 +55,7 @@ class FramePair:
     def of(cls, clip: Clip, keys: LoadedPhotos) -> FramePair:
         """The frames of a clip of two."""
         camera = keys.cameras.of(0)
-        number = {name: k for k, name in enumerate(clip.names)}
-        shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
+        shown = dict(zip(clip.places(keys.names).tolist(), (found.xy_raw for found in keys.features), strict=True))
         followed = follow(clip, shown, camera, most=_POINTS)
         first, second = (shown[k][followed.chosen[k]] for k in (0, 1))
         if clip.flows:

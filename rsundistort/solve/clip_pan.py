@@ -54,8 +54,7 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     # corners of key frames show it in no time, so that the frames between need not be followed
     if corners and not _only_rotates([_beyond_rotation(first, second, camera) for first, second in corners], camera):
         return None
-    number = {name: k for k, name in enumerate(clip.names)}
-    features = {number[name]: found for name, found in zip(keys.names, keys.features, strict=True)}
+    features = dict(zip(clip.places(keys.names).tolist(), keys.features, strict=True))
     shown = {key: found.xy_raw for key, found in features.items()}
     chained = _chained(clip, camera, features)
     if chained is None or 2 * len(chained[2]) < len(clip.names):

@@ -122,11 +122,13 @@ def followed_again(clip: Clip, followed: Followed, before: Reconstruction, recon
 
 def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, Index]:
     """The measurements of each key frame, by its number."""
-    number = {name: k for k, name in enumerate(clip.names)}
-    return {
-        number[name]: each
-        for name, each in zip(rec.image_names, rec.observations.by_photo(rec.num_images), strict=True)
-    }
+    by_photo = rec.observations.by_photo(rec.num_images)
+    return dict(zip(clip.places(rec.image_names).tolist(), by_photo, strict=True))
+
+
+def _poses(clip: Clip, rec: Reconstruction) -> dict[int, tuple[Array, Array]]:
+    """The pose of each frame, by its number."""
+    return dict(zip(clip.places(rec.image_names).tolist(), zip(rec.R_cw, rec.center_w, strict=True), strict=True))
 
 
 def follow(
@@ -193,19 +195,16 @@ def with_all_frames(
     key frames connect these, as before. Frames that were `placed_before` keep their poses.
     """
     rec, obs = reconstruction, reconstruction.observations
-    number = {name: k for k, name in enumerate(clip.names)}
-    image_of = {number[name]: i for i, name in enumerate(rec.image_names)}
     keys = sorted(followed.chosen)
     start = dict(zip(keys, np.cumsum([0, *(len(followed.chosen[k]) for k in keys)])[:-1].tolist(), strict=True))
     own = np.concatenate([followed.chosen[k] for k in keys])
-    frames = np.array([number[name] for name in rec.image_names])
+    frames = clip.places(rec.image_names)
     points_w = np.concatenate([rec.points_w, rec.points_w[obs.point_idx[own]]])
     point = rec.num_points + np.array([start[k] for k in followed.key.tolist()], np.int64) + followed.place
     at_key = np.concatenate([np.full(len(followed.chosen[k]), k) for k in keys])
-    poses = {k: (rec.R_cw[i], rec.center_w[i]) for k, i in image_of.items()}
+    poses = _poses(clip, rec)
     if placed_before is not None:
-        at = zip(placed_before.image_names, placed_before.R_cw, placed_before.center_w, strict=True)
-        poses = {number[name]: (R, c) for name, R, c in at} | poses
+        poses = _poses(clip, placed_before) | poses
     camera = rec.cameras[0]
     rays, valid = unproject_points(followed.xy_raw, camera, RowMotion(), "global")
     within = _ROOM_PX / float(camera.K[0, 0])
