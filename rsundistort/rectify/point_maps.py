@@ -26,14 +26,6 @@ _STEPS_PER_PX = 2
 _BISECTIONS = 50
 
 
-def _as_list(points: ArrayLike, name: str) -> tuple[Array, tuple[int, ...]]:
-    """Points (n, 2) of any of cv2's shapes: (n, 2), (n, 1, 2), (1, n, 2)."""
-    array = check_numbers(points, name)
-    if array.ndim not in (2, 3) or array.shape[-1] != 2 or (array.ndim == 3 and 1 not in array.shape[:2]):
-        raise InputError(f"{name}.shape={array.shape}, expected (N, 2), (N, 1, 2) or (1, N, 2)")
-    return array.reshape(-1, 2), array.shape
-
-
 def _homogeneous(xy: Array) -> Array:
     """(n, 3) points of z = 1; those that are no numbers become NaN, since infinity times zero is none."""
     xy = np.where(np.isfinite(xy).all(1, keepdims=True), xy, np.nan)
@@ -59,11 +51,14 @@ def _checked(
     depth: Depth | ArrayLike | None,
 ) -> tuple[Array, tuple[int, ...], RowMotion, Array, Depth | ArrayLike]:
     """Arguments of both directions: points (n, 2), their shape, the motion, rays of `rectified_rays`, and the depth."""
-    xy, shape = _as_list(points, "points")
+    xy = check_numbers(points, "points")
+    if xy.ndim not in (2, 3) or xy.shape[-1] != 2 or (xy.ndim == 3 and 1 not in xy.shape[:2]):
+        raise InputError(f"points.shape={xy.shape}, expected (N, 2), (N, 1, 2) or (1, N, 2)")
     depth = AtInfinity() if depth is None else depth
     if isinstance(depth, DepthMap) and P is None:
         raise InputError("a depth map has the pixels of the rectified photo: P is needed")
-    return xy, shape, motion_of(camera, motion), rectified_rays(np.eye(3) if P is None else P, R, camera), depth
+    motion, P = motion_of(camera, motion), np.eye(3) if P is None else P
+    return xy.reshape(-1, 2), xy.shape, motion, rectified_rays(P, R, camera), depth
 
 
 def _rectified(
