@@ -60,6 +60,13 @@ def evaluate(
         without a reference are not compared, if any has one.
     raw : path, optional
         Folder of the photos that were rectified, for the figure before; `photos` beside the truth file.
+    progress : callable, optional
+        Called as (stage, done, total).
+
+    Returns
+    -------
+    Evaluation
+        Errors of poses, motions and images; None where there is nothing to compare with.
     """
     out, truth = Path(out), Path(truth)
     written, true_solution = read_solution(out / "solution.json"), read_solution(truth)

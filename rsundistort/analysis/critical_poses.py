@@ -25,6 +25,12 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
         `solution.json`, or a folder that holds one (a run's output); a COLMAP model; a `transforms.json`.
     readout : str, optional
         Readout direction of all photos; else the solution's, else top-to-bottom.
+
+    Returns
+    -------
+    PoseAnalysis
+        The degeneracy measure of the poses; what the shape of a solution is worth; advice for the next shoot, if they
+        are critical.
     """
     path = Path(path)
     if readout is not None:

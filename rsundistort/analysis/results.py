@@ -101,6 +101,8 @@ class PoseAnalysis(_FormerlyDict):
         Poses that were analysed.
     readout : tuple of str
         Directions of readout among them.
+    degeneracy : CriticalMotion
+        How well the poses determine the shutter.
     sentence : str or None
         What the shape of the solution is worth; None of bare poses.
     advice : tuple of str

@@ -65,6 +65,8 @@ def rectify_folder(
     scheduler : str, optional
         Address of a Dask scheduler (tcp://host:8786) whose workers do the work, instead of threads. They see `photos`
         and `out` under the same absolute paths or URLs.
+    progress : callable, optional
+        Called as (stage, done, total).
     **named
         Fields of `RectifyOptions`, instead of or on top of `options`.
 

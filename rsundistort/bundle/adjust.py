@@ -55,6 +55,8 @@ def bundle_adjust(
         Start; its phi is the start of phi.
     shutter_model : {"global", "two-step", "linearized", "rotation", "constant-motion"}
         How the shutter is modelled.
+    options : BundleOptions, optional
+        Tolerances, loss, priors, constraints.
     progress : callable, optional
         Called with the cost after each accepted step.
     simpler_first : bool

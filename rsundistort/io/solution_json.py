@@ -209,6 +209,8 @@ def read_solution(path: Path, newer: bool = False) -> Solution:
 
     Parameters
     ----------
+    path : Path
+        Of the file.
     newer : bool
         Read one of a newer version as if it were of this, as far as that goes.
 

@@ -30,8 +30,12 @@ class SolvedImage:
         Photo, a file below its folder, and its camera.
     R_cw, center_w : (3, 3), (3,) array or None
         Pose at the principal row; None for a photo that did not register.
+    motion : RowMotion or None
+        Motion during the readout.
     sigma_phi : (3,) array or None
         Standard deviations of phi, if known.
+    num_observations : int
+        Measurements in this photo.
     rms_px : float or None
         Root mean square of the residuals' x and y parts.
     rs_shift_px : float or None

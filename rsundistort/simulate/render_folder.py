@@ -75,8 +75,19 @@ def simulate_scene(
 
     Parameters
     ----------
+    recipe : path or Recipe
+        What to render.
     out : path
         Folder for the outputs; it gets all of them or stays as it was.
+    options : SceneOptions, optional
+        See there.
+    progress : callable, optional
+        Called as (stage, done, total).
+
+    Returns
+    -------
+    Solution
+        The truth.
 
     Raises
     ------

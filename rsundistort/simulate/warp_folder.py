@@ -128,6 +128,10 @@ def simulate_warp(
     ----------
     photos, out : path
         Folder of photos taken without motion; folder for the outputs.
+    options : WarpOptions, optional
+        See there.
+    progress : callable, optional
+        Called as (stage, done, total).
 
     Returns
     -------

@@ -64,6 +64,10 @@ def run(
     out : path
         Folder for the outputs. It stays as it was until the motions are solved; then it gets the solution, and the
         rectified photos one by one.
+    options : RunOptions, optional
+        See there.
+    progress : callable, optional
+        Called as (stage, done, total).
     jobs, overwrite, scheduler
         As in `rectify_folder`.
     resume : bool
