@@ -139,13 +139,7 @@ def _row_motion(rec: Reconstruction, nb: int) -> tuple[Array, Array]:
 def common_motion(
     result: BundleResult, options: BundleOptions | None = None, posterior: Posterior | None = None
 ) -> CommonMotion:
-    """Uncertainty of the part of the motions that the photos share, from the covariance of a solution.
-
-    Parameters
-    ----------
-    result : BundleResult
-        Of a model with a shutter.
-    """
+    """Uncertainty of the part of the motions that photos share, from the covariance of a solution with a shutter."""
     rec = result.reconstruction
     m, nb = result.covariances.shape[:2]
     forward, back = _row_motion(rec, nb)

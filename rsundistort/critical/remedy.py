@@ -103,12 +103,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     in ten is, or it moved like the rest (zero mean; the robust standard deviation of phi2 and phi3, and the prior ones
     of the velocity and of the bends). Each is a prior on its motion in place of the one it was adjusted with; the
     likelier one is that under which the measurements are likelier. No other photo is taken as still, whatever the
-    options say.
-
-    Parameters
-    ----------
-    result : BundleResult
-        Of a model with a shutter.
+    options say. The model of the solution has a shutter.
     """
     rec = result.reconstruction
     m = rec.num_images

@@ -75,12 +75,7 @@ def match_photos(
 def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: Index | None = None) -> None:
     """Match and verify further pairs of photos; those that were matched before stay as they are.
 
-    Parameters
-    ----------
-    matched : MatchedPhotos
-        Photos of `match_photos`; gets the matches.
-    within_px, pairs
-        As there.
+    The photos are those of `match_photos`, and get the matches; `within_px` and `pairs` are as there.
     """
     close = close_px(matched.features)
     before = _matched_pairs(matched)
