@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,7 +88,8 @@ def closing_table(solution: Solution, out: Path) -> str:
         ("rms residual", f"{before}{quality['rms_px']:.2f} px{' now' * bool(before)}"),
         ("outputs", f"{out}  ({total:.0f} s)"),
     ]
-    lines = [table(rows), "", *_labelled(facts)]
+    # a text without a label is indented below the line above
+    lines = [table(rows), "", *(f"{label:<{_LABEL}}{text}" if label else f"  {text}" for label, text in facts)]
     critical, said = solution.critical_motion or {}, [verdict.sentences[2]]
     if critical.get("flagged"):
         # the same but for its capital
@@ -122,11 +123,6 @@ def fitted(text: str) -> list[str]:
             )
         )
     return lines
-
-
-def _labelled(facts: Iterable[tuple[str, str]]) -> list[str]:
-    """Lines of labels and texts; a text without a label is indented below the line above."""
-    return [f"{label:<{_LABEL}}{text}" if label else f"  {text}" for label, text in facts]
 
 
 def _source(solution: Solution) -> Iterator[tuple[str, str]]:

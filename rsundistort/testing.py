@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import FileError, FormatError, InputError
 from .io import read_photo, write_image
+from .model.array_types import Array, Mask
 from .model.arrays import read_arrays
 
 __all__ = ["Golden", "assert_images_close"]
@@ -226,7 +227,7 @@ def _expected_picture(expected: ArrayLike | str | Path) -> NDArray[Any]:
     return _as_picture(_read(path), str(path))
 
 
-def _compared(mask: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _compared(mask: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
     """Which pixels are compared: those where the mask is not 0."""
     compared = np.ones(shape, bool) if mask is None else np.asarray(mask) != 0
     if compared.shape != shape:
@@ -262,7 +263,7 @@ def _save(path: Path, values: NDArray[Any]) -> None:
         np.save(path, values)
 
 
-def _difference(got: NDArray[Any], expected: NDArray[Any]) -> NDArray[np.float64]:
+def _difference(got: NDArray[Any], expected: NDArray[Any]) -> Array:
     """Absolute differences; 0 where both are the same NaN or infinity, infinite where only one is."""
     a, b = got.astype(np.float64), expected.astype(np.float64)
     same = (a == b) | (np.isnan(a) & np.isnan(b))
@@ -293,7 +294,7 @@ def _show(picture: NDArray[Any], low: float | None = None, high: float | None = 
     return np.ascontiguousarray(picture)
 
 
-def _show_difference(by_pixel: NDArray[np.float64], tolerance: float) -> NDArray[np.uint8]:
+def _show_difference(by_pixel: Array, tolerance: float) -> NDArray[np.uint8]:
     """Grey picture of differences: up to 100 within the tolerance, 160 to 255 beyond, so that lone pixels show."""
     finite = by_pixel[np.isfinite(by_pixel)]
     worst = max(float(finite.max(initial=0.0)), np.finfo(np.float64).tiny)

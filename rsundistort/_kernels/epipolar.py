@@ -22,9 +22,7 @@ def freed(phi, clock, ray):
 @kernel(forceinline=True)
 def slope_squared(phi, clock, slopes, rate, x, y, z, a, b, g0, g1, g2):
     """Square of the derivative by the raw pixel of g . Exp(-clock phi) ray, which is x, y, z; the clock moves, too."""
-    by_clock = -(
-        g0 * (phi[1] * z - phi[2] * y) + g1 * (phi[2] * x - phi[0] * z) + g2 * (phi[0] * y - phi[1] * x)
-    )  # fmt: skip
+    by_clock = -(g0 * (phi[1] * z - phi[2] * y) + g1 * (phi[2] * x - phi[0] * z) + g2 * (phi[0] * y - phi[1] * x))
     # back into the frame of the ray: the inverse rotation
     w0, w1, w2 = -clock * phi[0], -clock * phi[1], -clock * phi[2]
     k0, k1, k2 = rotate(w0, w1, w2, -a, b, g0, g1, g2)

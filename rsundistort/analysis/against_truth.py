@@ -16,6 +16,7 @@ from ..errors import FileError, InputError
 from ..evaluation import motion_errors, pose_errors, psnr
 from ..io import output_name, read_photo, read_solution
 from ..model import RowMotion, Solution, SolvedImage
+from ..model.array_types import Array
 from ..model.orientation import INVERSE, in_stored_frame, orient_pixels
 from ..rectify import rectify
 from .results import ErrorSummary, Evaluation, PhiErrorSummary, PsnrSummary
@@ -23,7 +24,7 @@ from .results import ErrorSummary, Evaluation, PhiErrorSummary, PsnrSummary
 __all__ = ["evaluate"]
 
 
-def _summary(values: NDArray[np.float64]) -> ErrorSummary:
+def _summary(values: Array) -> ErrorSummary:
     return ErrorSummary(float(np.mean(values)), float(np.median(values)), float(np.max(values)))
 
 

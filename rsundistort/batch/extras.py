@@ -19,8 +19,6 @@ class AlsoImage:
 
     Attributes
     ----------
-    source : Path
-        The image.
     target : str
         Where it goes, in the folder of the outputs.
     interpolation : str
@@ -39,8 +37,6 @@ def find_extras(also: Sequence[tuple[Path, str]], names: Sequence[str]) -> dict[
     ----------
     also : sequence of (folder, interpolation)
         Folders of images of the photos' stems and sizes; they go to `out/also`, into folders of the same names.
-    names : sequence of str
-        Photos.
 
     Raises
     ------

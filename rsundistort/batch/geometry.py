@@ -10,12 +10,12 @@ from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortWarning
 from ..io import find_depth_maps, output_name, read_colmap_poses, read_depth_map
 from ..io.places import local_place
 from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, Reconstruction, RowMotion, Solution
+from ..model.array_types import Array, Index
 from ..rectify import (
     depth_from_points,
     fit_plane,
@@ -55,8 +55,8 @@ class ScenePoints:
         Points that a photo measured.
     """
 
-    points_w: NDArray[np.float64]
-    seen: Mapping[str, NDArray[np.int64]]
+    points_w: Array
+    seen: Mapping[str, Index]
 
     @classmethod
     def of_reconstruction(cls, rec: Reconstruction) -> ScenePoints:
@@ -72,9 +72,7 @@ class ScenePoints:
         return cls(points_w, {name: points for name, points in mine.items() if points is not None})
 
 
-def _by_photo(
-    names: Sequence[str], frame_idx: NDArray[np.int64], point_idx: NDArray[np.int64]
-) -> dict[str, NDArray[np.int64]]:
+def _by_photo(names: Sequence[str], frame_idx: Index, point_idx: Index) -> dict[str, Index]:
     order = np.argsort(frame_idx, kind="stable")
     bounds = np.searchsorted(frame_idx[order], np.arange(len(names) + 1))
     return {name: np.unique(point_idx[order[bounds[i] : bounds[i + 1]]]) for i, name in enumerate(names)}
@@ -83,9 +81,9 @@ def _by_photo(
 class _Seen(NamedTuple):
     """Points that a photo measured: rectified pixels (n, 2), directions (n, 3) of z = 1, depths (n,)."""
 
-    xy: NDArray[np.float64]
-    rays_c: NDArray[np.float64]
-    depth: NDArray[np.float64]
+    xy: Array
+    rays_c: Array
+    depth: Array
 
 
 @dataclass(frozen=True)
@@ -145,7 +143,7 @@ class PhotoGeometry:
     motion: RowMotion
     shutter_model: str
     how: str | None = None
-    points_c: NDArray[np.float64] | None = None
+    points_c: Array | None = None
     plane: Plane | None = None
     own_map: Path | None = None
 
@@ -242,7 +240,7 @@ class SceneGeometry:
         self._maps = find_depth_maps(Path(depth).absolute(), sorted(self._moving)) if own else {}
         if self._how in ("plane", "points") and points is None and self._moving:
             raise InputError(f"depth {self._how!r} needs the points of the scene, and there are none")
-        self._plane: tuple[NDArray[np.float64], float] | None = None
+        self._plane: tuple[Array, float] | None = None
         if self._moving and points is not None and len(points.points_w) >= 3 and self._how in ("auto", "plane"):
             self._plane = fit_plane(points.points_w)
 

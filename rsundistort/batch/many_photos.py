@@ -20,6 +20,7 @@ from ..io.photos.kinds import kind_of_name
 from ..io.places import Place, RemoteFolder, absolute, files_of, place_of, sizes_under
 from ..io.record import Record
 from ..model import Reconstruction, Solution
+from ..model.array_types import Array, Index
 from .extras import find_extras
 from .geometry import DEPTHS, SceneGeometry
 from .one_photo import PhotoDone, PhotoJob, photo_colors, rectify_photo
@@ -67,8 +68,6 @@ def rectify_photos(
 
     Parameters
     ----------
-    folder, scene, names
-        Of the raw photos, their geometry, and which of them.
     out : Path or RemoteFolder
         `batch_folder` made it ready, and gave `journal`.
     options, workers, log, journal
@@ -156,7 +155,7 @@ def _look_again(jobs: _Jobs, names: Sequence[str], workers: Workers, colors: Poi
             colors.add(name, each)
 
 
-def _unseen(job: PhotoJob, why: str) -> NDArray[np.float64]:
+def _unseen(job: PhotoJob, why: str) -> Array:
     raise FileError(f"{job.name}: {why}")
 
 
@@ -268,11 +267,11 @@ class PointColors:
         self._sum = np.zeros((reconstruction.num_points, 3), np.int64)
         self._count = np.zeros(reconstruction.num_points)
 
-    def pixels(self, name: str) -> NDArray[np.int64]:
+    def pixels(self, name: str) -> Index:
         """(k, 2) raw pixels where a photo shows points."""
         return np.rint(self._seen.xy_raw[self._of[name]]).astype(np.int64)
 
-    def add(self, name: str, colors: NDArray[np.float64]) -> None:
+    def add(self, name: str, colors: Array) -> None:
         """Take the (k, 3) colours at those pixels, 0 to 255."""
         points = self._seen.point_idx[self._of[name]]
         np.add.at(self._sum, points, np.rint(self._FINE * colors).astype(np.int64))

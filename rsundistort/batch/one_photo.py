@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MetadataWarning
 from ..io import MAX_MEGAPIXELS, Photo, read_mask, read_photo, write_image
@@ -22,6 +21,7 @@ from ..io.outputs import CANNOT_WRITE, held_inside
 from ..io.photos.exif import read_orientation
 from ..io.places import File, Place, RemoteFile, fetched
 from ..model import Depth
+from ..model.array_types import Array, Index
 from ..model.brightness import white_level
 from ..model.orientation import orient_pixels, split_mirror
 from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify
@@ -44,22 +44,14 @@ class PhotoJob:
     ----------
     name : str
         Of the photo, for people.
-    source : Path or RemoteFile
-        The raw photo.
-    out : Path or RemoteFolder
-        Folder of the outputs.
     image, mask : str
         Rectified photo and its mask, in `out`.
     geometry : PhotoGeometry
         All that its remap grid takes.
     posed : bool
         Whether the photo has a pose, which no mirror image has.
-    options : RectifyOptions
-        See there.
     own_mask : Path, RemoteFile or None
         The user's mask of it.
-    also : tuple of AlsoImage
-        Other images of its frame.
     maps : str or None
         Beginning of the names of the files of its grid, in `out`.
     sample_xy : (k, 2) int array or None
@@ -77,7 +69,7 @@ class PhotoJob:
     own_mask: File | None = None
     also: tuple[AlsoImage, ...] = ()
     maps: str | None = None
-    sample_xy: NDArray[np.int64] | None = None
+    sample_xy: Index | None = None
 
     @property
     def inputs(self) -> list[File]:
@@ -148,8 +140,6 @@ class PhotoDone:
 
     Attributes
     ----------
-    name : str
-        Of the photo.
     problem : str
         Why it was left out; empty if it was not.
     fingerprint : str
@@ -170,7 +160,7 @@ class PhotoDone:
     files: Mapping[str, int] = field(default_factory=dict)
     orientation: int = 1
     depth: tuple[str, float, float] | None = None
-    colors: NDArray[np.float64] | None = None
+    colors: Array | None = None
 
 
 def check_not_rectified(photo: Photo) -> None:
@@ -298,14 +288,14 @@ def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:
     warnings.warn(text, MetadataWarning, stacklevel=2)
 
 
-def photo_colors(job: PhotoJob) -> NDArray[np.float64]:
+def photo_colors(job: PhotoJob) -> Array:
     """(k, 3) colours of a photo that is rectified already, at `PhotoJob.sample_xy`."""
     assert job.sample_xy is not None
     with tempfile.TemporaryDirectory(prefix="rsundistort-") as work:
         return _colors(read_photo(fetched(job.source, Path(work)), job.options.max_megapixels), job.sample_xy)
 
 
-def _colors(photo: Photo, xy: NDArray[np.int64]) -> NDArray[np.float64]:
+def _colors(photo: Photo, xy: Index) -> Array:
     """(k, 3) red, green, blue at pixels, 0 to 255."""
     h, w = photo.pixels.shape[:2]
     values = photo.pixels[np.clip(xy[:, 1], 0, h - 1), np.clip(xy[:, 0], 0, w - 1)].astype(float)

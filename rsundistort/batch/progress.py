@@ -16,13 +16,7 @@ ProgressCallback = Callable[[str, int, int], None]
 
 
 class StageLog:
-    """Times stages and passes their progress on.
-
-    Parameters
-    ----------
-    callback : callable, optional
-        See `ProgressCallback`.
-    """
+    """Times stages and passes their progress on."""
 
     def __init__(self, callback: ProgressCallback | None) -> None:
         self._callback = callback

@@ -60,8 +60,6 @@ def rectify_clip(
         As in `rectify`.
     workers : Workers
         Its threads are used, and no cluster: the frames come one after the other.
-    log : StageLog
-        Gets the progress.
 
     Raises
     ------

@@ -122,8 +122,6 @@ def adjust_sequence(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        Start of the first.
     models : sequence of str
         Shutter models, the simplest first.
     options : BundleOptions, optional

@@ -139,8 +139,6 @@ def choose_model(
         Of the fits, which are approximate and use squares. Without refined intrinsics none vary either.
     sigma_px : float
         Noise of the measurements, as estimated by the last adjustment.
-    seed : int
-        Of the choice of measurements.
     progress : callable, optional
         Called as (model, cost).
     """

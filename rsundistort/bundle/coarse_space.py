@@ -85,9 +85,7 @@ class CoarseSpace:
         nb = self.free.shape[1]
         E = np.empty((len(self.envelope.pattern.cols), _FUNCTIONS * nb, _FUNCTIONS * nb))
         with numba.parallel_chunksize(1):
-            blocks.project_blocks(
-                self.rotation, self.free.astype(float), self.functions, *self.entries, reduced.S, E
-            )  # fmt: skip
+            blocks.project_blocks(self.rotation, self.free.astype(float), self.functions, *self.entries, reduced.S, E)
         diagonal = np.einsum("caa->ca", E[self.envelope.pattern.diagonal])
         E[self.envelope.pattern.diagonal] += _RIDGE * diagonal[:, :, None] * np.eye(_FUNCTIONS * nb)
         border = np.array([self.restrict(row) for row in reduced.border]).reshape(len(reduced.border), *diagonal.shape)

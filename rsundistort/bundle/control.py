@@ -52,10 +52,7 @@ def with_control(reconstruction: Reconstruction, points: Sequence[ControlPoint],
     `sigma` is their standard deviation in the image relative to the best measurements.
     """
     rec, index = reconstruction, {name: i for i, name in enumerate(reconstruction.image_names)}
-    seen = [
-        [(index[name], *xy) for name, xy in each.seen.items() if name in index]
-        for each in points
-    ]  # fmt: skip
+    seen = [[(index[name], *xy) for name, xy in each.seen.items() if name in index] for each in points]
     seen = [each for each in seen if len(each) > 1]
     if not seen:
         return rec

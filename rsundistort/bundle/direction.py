@@ -61,8 +61,6 @@ def choose_readouts(
         Poses, points and measurements; its motions are not used.
     open_cameras : sequence of int
         Cameras whose direction is a guess.
-    options : BundleOptions, optional
-        Of the fits.
     progress : callable, optional
         Called as (model, cost).
     """

@@ -32,8 +32,6 @@ class Elimination:
 
     Attributes
     ----------
-    structure : Structure
-        Which photo sees which point.
     free : (m, nb) bool array
         Unknowns that are not held.
     shape : Envelope or SparseBlocks
@@ -88,9 +86,7 @@ class Elimination:
             return cls(structure, free, shape, space, cg_tolerance, _MAX_CG)
         iteration = products + _WAIT * 2 * space.envelope.num_values
         worth = 2 * (space.envelope.multiply_adds + _EXPECTED_CG * iteration) < adds
-        return cls(
-            structure, free, shape, space if worth else None, cg_tolerance, min(_MAX_CG, int(adds / iteration))
-        )  # fmt: skip
+        return cls(structure, free, shape, space if worth else None, cg_tolerance, min(_MAX_CG, int(adds / iteration)))
 
     def solve(self, reduced: Reduced, exact: bool = False) -> tuple[Array, Array, Array, Array] | None:
         """Solution of the photos (m, nb), 0 where held, and of the cameras (k,), with the residuals of both.

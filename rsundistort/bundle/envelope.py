@@ -27,8 +27,6 @@ class Envelope:
 
     Attributes
     ----------
-    pattern : BlockPattern
-        Where the matrix has blocks.
     place : (m, nb) int array
         Row of the unknowns of each block row; -1 where held.
     first, offset : (bands,) int array
@@ -108,8 +106,6 @@ class CholeskyFactor:
 
     Attributes
     ----------
-    shape : Envelope
-        Where it has entries.
     data : (num_values,) array
         These.
     scale : (padded rows,) array

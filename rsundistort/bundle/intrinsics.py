@@ -168,9 +168,7 @@ def moved_camera(camera: Camera, names: Sequence[str], step: Array) -> Camera:
     return replace(camera, K=K, dist=dist if dist.any() else camera.dist)
 
 
-def deviation(
-    camera: Camera, guess: Camera, names: Sequence[str]
-) -> tuple[Array, Array]:  # fmt: skip
+def deviation(camera: Camera, guess: Camera, names: Sequence[str]) -> tuple[Array, Array]:
     """How far (len(names),) a camera is from a guess, in the units of `GuessedCameras`; derivatives in the unknowns."""
     fx, fy, cx, cy = camera.kernel_args[0]
     gx, gy, gcx, gcy = guess.kernel_args[0]

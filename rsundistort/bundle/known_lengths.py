@@ -49,15 +49,7 @@ def scale_of_lengths(reconstruction: Reconstruction, lengths: Sequence[KnownLeng
 
 
 class LengthResiduals:
-    """Residuals of known lengths: logarithms of their ratios, the common scale taken out.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Whose points are meant.
-    lengths : sequence of KnownLength
-        None, or two and more.
-    """
+    """Residuals of known lengths, none or two and more: logarithms of their ratios, the common scale taken out."""
 
     def __init__(self, reconstruction: Reconstruction, lengths: Sequence[KnownLength]) -> None:
         ends = [

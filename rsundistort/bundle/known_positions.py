@@ -69,12 +69,7 @@ def point_of(reconstruction: Reconstruction, control: ControlPoint) -> int | Non
 class PlaceResiduals:
     """Residuals of known places in a state: of centres and of points in their standard deviations.
 
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Whose photos and points are meant.
-    known : KnownPlaces
-        Fewer than three places hold no frame, and say nothing.
+    Fewer than three places hold no frame, and say nothing.
 
     Attributes
     ----------

@@ -201,10 +201,6 @@ class PathPrior:
 
     Parameters
     ----------
-    path : FramePath
-        Times.
-    reconstruction : Reconstruction
-        Whose photos they are.
     sigmas : (rotation, travel)
         Square roots of the spectral densities Q: radians, and world units, per (time between frames)^(5/2).
     """

@@ -18,12 +18,7 @@ __all__ = ["Posterior", "gauge_directions"]
 class Posterior:
     """Covariances at a result, all unknowns being free but the constraints and the gauge.
 
-    Parameters
-    ----------
-    result : BundleResult
-        Where.
-    options : BundleOptions, optional
-        Those of the adjustment: constraints, known motions and refined intrinsics count.
+    The options are those of the adjustment: constraints, known motions and refined intrinsics count.
     """
 
     def __init__(self, result: BundleResult, options: BundleOptions | None = None) -> None:

@@ -213,9 +213,7 @@ def _means_prior(
     found = ((common.values / likely) ** 2 + common.variances / likely)[sharing, 3:]
     velocity = max(velocity, float(np.sqrt(found.mean())))
     cameras = np.unique(current.camera_idx[sharing])
-    return prior_of_means(
-        common.unknowns[cameras], common.covariances[cameras], common.root, velocity, depth, freedom
-    )  # fmt: skip
+    return prior_of_means(common.unknowns[cameras], common.covariances[cameras], common.root, velocity, depth, freedom)
 
 
 def _own_motions(current: Reconstruction, covariances: Array, common: Common | None) -> tuple[Array, Array]:

@@ -275,10 +275,7 @@ class BundleProblem:
         s, start = self.structure, self._start
         camera = start.camera_idx[s.frame_idx]
         size = np.array([(each.width, each.height) for each in start.cameras])[camera]
-        return (
-            by_place(state.points_w, s.point_idx, start.num_images),
-            by_corner(self._xy, size, camera),
-        )
+        return by_place(state.points_w, s.point_idx, start.num_images), by_corner(self._xy, size, camera)
 
     def reconstruction(self, state: State) -> Reconstruction:
         """The reconstruction at a state."""

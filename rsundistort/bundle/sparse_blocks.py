@@ -49,8 +49,6 @@ class SparseBlocks:
 
     Attributes
     ----------
-    pattern : BlockPattern
-        Where the matrix has blocks.
     free : (m, nb) bool array
         Unknowns that are not held.
     rank : (m, parts) int array
@@ -175,8 +173,6 @@ class BlockFactor:
 
     Attributes
     ----------
-    shape : SparseBlocks
-        Where it has blocks.
     data : (num_values,) array
         These.
     scale : (m, nb) array

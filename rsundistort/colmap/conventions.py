@@ -10,7 +10,8 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..model.array_types import Array
 
 __all__ = ["HALF", "import_pycolmap", "kept_log_level", "poses_of", "quiet_pycolmap", "rigid_of"]
 
@@ -60,13 +61,13 @@ def quiet_pycolmap() -> Any:
     return pycolmap
 
 
-def poses_of(images: Sequence[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poses_of(images: Sequence[Any]) -> tuple[Array, Array]:
     """Rotations R_cw (m, 3, 3) and centres (m, 3) of pycolmap's images."""
     poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     R_cw = poses[:, :, :3]
     return R_cw, -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3])
 
 
-def rigid_of(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> Any:
+def rigid_of(R_cw: Array, center_w: Array) -> Any:
     """Pycolmap's pose of a rotation (3, 3) and a centre (3,)."""
     return import_pycolmap().Rigid3d(np.column_stack([R_cw, -R_cw @ center_w]))

@@ -7,21 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FormatError, format_errors
 from ..model import Camera
+from ..model.array_types import Array
 from ..model.projection import project_points
 from .conventions import HALF, import_pycolmap
 
-__all__ = [
-    "FIT_PX",
-    "camera_from_colmap",
-    "camera_to_colmap",
-    "nearest_camera",
-    "pinhole_to_colmap",
-    "refined_camera",
-]
+__all__ = ["FIT_PX", "camera_from_colmap", "camera_to_colmap", "nearest_camera", "pinhole_to_colmap", "refined_camera"]
 
 # COLMAP's camera models that are ours with some of the coefficients zero: the lens, the number of coefficients
 _LENSES = {
@@ -81,9 +74,7 @@ def _fitted_camera(found: Any, where: str) -> Camera:
     return best
 
 
-def nearest_camera(
-    rays: NDArray[np.float64], xy_raw: NDArray[np.float64], start: Camera
-) -> tuple[Camera | None, float]:
+def nearest_camera(rays: Array, xy_raw: Array, start: Camera) -> tuple[Camera | None, float]:
     """The camera of ours that shows rays nearest to given pixels, and by how many pixels the worst one misses.
 
     Parameters
@@ -108,11 +99,11 @@ def nearest_camera(
     ahead = np.column_stack([rays, np.ones(len(rays))])
     K0 = [start.K[0, 0], start.K[1, 1], start.K[0, 2], start.K[1, 2]]
 
-    def camera_of(p: NDArray[np.float64], lens: str) -> Camera:
+    def camera_of(p: Array, lens: str) -> Camera:
         K = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]])
         return Camera(start.width, start.height, K, p[4:], lens=lens)
 
-    def error_px(p: NDArray[np.float64], lens: str) -> NDArray[np.float64]:
+    def error_px(p: Array, lens: str) -> Array:
         seen = project_points(ahead, camera_of(p, lens), None, "global")[0]
         return np.nan_to_num(seen - xy_raw, nan=1e3, posinf=1e3, neginf=-1e3).ravel()
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError
 from ..model import Observations, Reconstruction
+from ..model.array_types import Index, Mask
 from ..model.reprojection import reprojection_residuals
 from .cameras_and_poses import image_name
 from .conventions import HALF, poses_of
@@ -54,10 +55,10 @@ class ColmapModel:
     """
 
     reconstruction: Reconstruction
-    camera_ids: NDArray[np.int64]
-    image_ids: NDArray[np.int64]
-    point_ids: NDArray[np.int64]
-    keypoint_idx: NDArray[np.int64]
+    camera_ids: Index
+    image_ids: Index
+    point_ids: Index
+    keypoint_idx: Index
     colors: NDArray[np.uint8]
     unregistered: Sequence[str]
     self_calibrated: bool = False
@@ -78,7 +79,7 @@ class ColmapModel:
             colors=self.colors[alive],
         )
 
-    def ids_of(self, points: NDArray[np.int64], names: Sequence[str]) -> ModelIds:
+    def ids_of(self, points: Index, names: Sequence[str]) -> ModelIds:
         """Ids of a reconstruction's parts, of which these old points (-1: none) and photos became.
 
         Points without an old one get ids above all that there are.
@@ -90,7 +91,7 @@ class ColmapModel:
         return ModelIds(self.camera_ids.tolist(), [image_id[name] for name in names], ids.tolist())
 
 
-def surviving_points(before: Reconstruction, after: Reconstruction) -> NDArray[np.int64]:
+def surviving_points(before: Reconstruction, after: Reconstruction) -> Index:
     """(n,) for each point of `after` the point of `before` that it continues, or -1.
 
     It is the one most of its measurements belonged to; an old point goes on in the new one that has most of them.
@@ -206,7 +207,7 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
     ).once_a_photo()
 
 
-def _once_a_photo(rec: Reconstruction) -> NDArray[np.bool_]:
+def _once_a_photo(rec: Reconstruction) -> Mask:
     """(o,) measurements but those by which a photo sees a point again, farther from its projection."""
     obs = rec.observations
     res, valid = reprojection_residuals(rec)

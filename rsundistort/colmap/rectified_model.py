@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Camera, Reconstruction
+from ..model.array_types import Array
 from ..model.projection import at_depth, unproject_points
 from .conventions import HALF, import_pycolmap, rigid_of
 from .lenses import pinhole_to_colmap
@@ -40,7 +41,7 @@ class ModelIds:
         return cls(*(range(1, 1 + count) for count in (len(rec.cameras), rec.num_images, rec.num_points)))
 
 
-def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera]) -> NDArray[np.float64]:
+def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera]) -> Array:
     """(o, 2) where the measurements lie in the rectified photos, pixels with integer centres.
 
     Parameters

@@ -38,12 +38,7 @@ $COLMAP_EXE_PATH/colmap delaunay_mesher \
 def write_colmap_workspace(folder: Path, names: Sequence[str]) -> None:
     """Write what COLMAP's dense stereo needs beside `images/` and `sparse/`: `stereo/`, and the scripts that run it.
 
-    Parameters
-    ----------
-    folder : Path
-        The workspace.
-    names : sequence of str
-        The photos of the model, by their ids.
+    The names are those of the photos of the model, by their ids.
     """
     stereo = folder / "stereo"
     for product in _PRODUCTS:

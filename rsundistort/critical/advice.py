@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..bundle import BundleOptions, BundleResult
 from ..model import Observations, Reconstruction
+from ..model.array_types import Array
 from ..model.projection import project_points
 from .cost import ShapeCost, shape_cost
 from .degeneracy import critical_motion
@@ -53,9 +53,7 @@ class Advice:
         return said if self.shift_px is None else f"{said}, the rectified photos by {self.shift_px:.2g} px"
 
 
-def _candidates(
-    R_cw: NDArray[np.float64], center_w: NDArray[np.float64], pivots: NDArray[np.float64]
-) -> list[tuple[str, list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]]]:
+def _candidates(R_cw: Array, center_w: Array, pivots: Array) -> list[tuple[str, list[tuple[int, Array, Array]]]]:
     """Photos that could be added: words, and the photos as (photo that it repeats, R_cw, center_w).
 
     Tilted photos are taken from above or below, rotated about the `pivots` (m, 3), what the photos look at.
@@ -76,9 +74,7 @@ def _candidates(
     ]
 
 
-def advise_poses(
-    R_cw: NDArray[np.float64], center_w: NDArray[np.float64], readout: Sequence[str]
-) -> list[Advice]:  # fmt: skip
+def advise_poses(R_cw: Array, center_w: Array, readout: Sequence[str]) -> list[Advice]:
     """Advice from poses alone, (m, 3, 3) and (m, 3), with the readout of each; see `advise`."""
     # the distance of the scene is taken as that of the cameras
     distance = np.linalg.norm(center_w - center_w.mean(0), axis=1).max(initial=0.0) or 1.0
@@ -123,9 +119,7 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
     return found
 
 
-def _with_view(
-    rec: Reconstruction, like: int, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
-) -> Reconstruction:
+def _with_view(rec: Reconstruction, like: int, R_cw: Array, center_w: Array) -> Reconstruction:
     """The reconstruction with one more photo of points that another photo sees; unchanged if it sees too few."""
     obs = rec.observations
     camera = rec.camera(like)

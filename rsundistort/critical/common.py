@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, BundleResult, Posterior
 from ..model import Reconstruction
+from ..model.array_types import Array, Index
 from ..model.projection import clock_of
 
 __all__ = ["CommonMotion", "clock_contrast", "common_motion", "row_phi"]
-
-Array = NDArray[np.float64]
 
 # Above this contrast of the clocks photos determine a common motion as well as others; as the limit of the measure.
 _LOW = 0.15
@@ -110,7 +108,7 @@ class CommonMotion:
         return f"{_ROTATIONS[swap[rotation]]} and {_WAYS[swap[way]]} {how}: {left}"
 
 
-def row_phi(reconstruction: Reconstruction) -> NDArray[np.int64]:
+def row_phi(reconstruction: Reconstruction) -> Index:
     """Components (m, 3) of phi that are each photo's phi1, phi2, phi3 of the paper, which reads rows."""
     by_row = np.array([reconstruction.camera(i).clock_axis == 1 for i in range(reconstruction.num_images)])
     return np.where(by_row[:, None], [0, 1, 2], [1, 0, 2]).astype(np.int64)
@@ -141,17 +139,7 @@ def _row_motion(rec: Reconstruction, nb: int) -> tuple[Array, Array]:
 def common_motion(
     result: BundleResult, options: BundleOptions | None = None, posterior: Posterior | None = None
 ) -> CommonMotion:
-    """Uncertainty of the part of the motions that the photos share, from the covariance of a solution.
-
-    Parameters
-    ----------
-    result : BundleResult
-        Of a model with a shutter.
-    options : BundleOptions, optional
-        Of the adjustment.
-    posterior : Posterior, optional
-        Of both, where it is at hand.
-    """
+    """Uncertainty of the part of the motions that photos share, from the covariance of a solution with a shutter."""
     rec = result.reconstruction
     m, nb = result.covariances.shape[:2]
     forward, back = _row_motion(rec, nb)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, BundleResult, Posterior, gauge_directions
 from ..errors import InputError
 from ..model import Reconstruction
+from ..model.array_types import Array
 from .common import CommonMotion, common_motion
 from .degeneracy import CriticalMotion, critical_motion, readout_axes
 
@@ -35,10 +35,6 @@ class ShapeCost:
         the largest variance, other than motions of the world. Rotations and phi in radians, lengths in baselines.
     weakest_share : float
         Share of the vertical scale in that mode: square of the correlation of the two, 0 to 1.
-    degeneracy : CriticalMotion
-        Of the solution's poses.
-    common : CommonMotion
-        Uncertainty of the part of the motions that the photos share.
     """
 
     sigma_log_k: float
@@ -75,7 +71,7 @@ class ShapeCost:
         return f"{said}, because the cameras were not rotated against each other"
 
 
-def _uncertainty(reconstruction: Reconstruction) -> NDArray[np.float64]:
+def _uncertainty(reconstruction: Reconstruction) -> Array:
     """(n,) uncertainty of each point along its worst direction, in units of a ray's angle times its length.
 
     Large where all who see a point stand in one place, as two copies of a photo do.
@@ -90,7 +86,7 @@ def _uncertainty(reconstruction: Reconstruction) -> NDArray[np.float64]:
     return np.asarray(1.0 / np.sqrt(np.maximum(least, 1e-24 * np.maximum(np.median(least), 1e-300))))
 
 
-def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
+def _log_scale(reconstruction: Reconstruction) -> Array:
     """(n, 3) the logarithm of the scene's scale along the axis of readout, as a linear function of small changes.
 
     Of the affine map B that takes the points to the changed ones best: log |B y| - log sqrt(det B / |B y|). Far points
@@ -134,7 +130,7 @@ def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> Sh
     unit[3:6] = unit[9:] = rec.baseline
     basis = np.linalg.qr((gauge_directions(result) / unit).reshape(7, -1).T)[0]
 
-    def free(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def free(x: Array) -> Array:
         return (x.ravel() - basis @ (basis.T @ x.ravel())).reshape(with_photos.shape)
 
     # power iterations with the covariance in the gauge of least variance: P C P, P projecting off motions of the world

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..model import check_readout
+from ..model.array_types import Array, Mask
 from ..model.checks import check_finite, check_rotations, frozen
 
 __all__ = ["CriticalMotion", "critical_motion", "readout_axes"]
@@ -39,12 +40,10 @@ class CriticalMotion:
     y_axis_spread_deg : float
         Root mean square angle between the axes along which the photos were read out (y for rows, x for columns), taken
         as lines, and their mean line.
-    num_photos : int
-        Photos.
     """
 
-    singular_values: NDArray[np.float64]
-    null_vector: NDArray[np.float64]
+    singular_values: Array
+    null_vector: Array
     y_axis_spread_deg: float
     num_photos: int
 
@@ -82,14 +81,12 @@ class CriticalMotion:
         return "the scene's shape, by a projective change that skew and aspect ratio hide"
 
 
-def readout_axes(R_cw: NDArray[np.float64], readout: Sequence[str]) -> NDArray[np.float64]:
+def readout_axes(R_cw: Array, readout: Sequence[str]) -> Array:
     """(m, 3) world directions along which the photos were read out: y axes of rows, x axes of columns, no sign."""
     return np.array([R[check_readout(direction)[0]] for R, direction in zip(R_cw, readout, strict=True)])
 
 
-def _equations(
-    R_cw: NDArray[np.float64], center_w: NDArray[np.float64], by_column: NDArray[np.bool_], reference: int
-) -> NDArray[np.float64]:
+def _equations(R_cw: Array, center_w: Array, by_column: Mask, reference: int) -> Array:
     """(3 (m - 1), 5) linearised self-calibration with one photo's skew, aspect ratio and plane at infinity unknown."""
     others = np.delete(np.arange(len(R_cw)), reference)
     # every photo as one that was read by rows

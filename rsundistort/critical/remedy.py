@@ -6,11 +6,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..bundle import BundleOptions, BundleResult, Posterior, bundle_adjust
 from ..bundle.common_motion import MotionMeans
 from ..errors import InputError
+from ..model.array_types import Array
 from .common import row_phi
 from .cost import ShapeCost, shape_cost
 
@@ -95,21 +96,14 @@ def _freed(result: BundleResult, options: BundleOptions | None) -> Posterior:
     return Posterior(result, replace(given, still={}, held_phi={}, bends=len(result.bend_sigmas)))
 
 
-def still_probability(result: BundleResult, options: BundleOptions | None = None) -> NDArray[np.float64]:
+def still_probability(result: BundleResult, options: BundleOptions | None = None) -> Array:
     """(m,) probability that each photo did not move, from what all others leave undetermined of its motion.
 
     Either the photo was still (zero motion, up to 1 mrad per frame and the translation that displaces as much), as one
     in ten is, or it moved like the rest (zero mean; the robust standard deviation of phi2 and phi3, and the prior ones
     of the velocity and of the bends). Each is a prior on its motion in place of the one it was adjusted with; the
     likelier one is that under which the measurements are likelier. No other photo is taken as still, whatever the
-    options say.
-
-    Parameters
-    ----------
-    result : BundleResult
-        Of a model with a shutter.
-    options : BundleOptions, optional
-        Of the adjustment.
+    options say. The model of the solution has a shutter.
     """
     rec = result.reconstruction
     m = rec.num_images
@@ -126,7 +120,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     bends = freed.bend_sigmas
     steady = motion.shape[1] - len(bends)
 
-    def precision(of_phi: ArrayLike, of_velocity: ArrayLike, of_bends: NDArray[np.float64]) -> NDArray[np.float64]:
+    def precision(of_phi: ArrayLike, of_velocity: ArrayLike, of_bends: Array) -> Array:
         """(m, k, k) of a prior, per unit of the clock."""
         sigma = np.repeat(np.stack(np.broadcast_arrays(of_phi, of_velocity, span)[:2], axis=1), 3, axis=1)
         sigma = np.hstack([sigma[:, :steady] / span[:, None], np.broadcast_to(of_bends, (m, len(bends)))])
@@ -143,7 +137,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     value, vector = np.linalg.eigh(inside - own)  # nothing where nothing else is known
     inside = np.einsum("mij,mj,mkj->mik", vector, np.maximum(value, 0.0), vector)
 
-    def evidence(prior: NDArray[np.float64]) -> NDArray[np.float64]:
+    def evidence(prior: Array) -> Array:
         """(m,) log likelihoods of a prior, up to a constant."""
         total = inside + prior
         gain = np.einsum("mi,mi->m", pull, np.linalg.solve(total, pull[..., None])[..., 0])
@@ -155,9 +149,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     return 1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500)))
 
 
-def _expected(
-    result: BundleResult, freed: Posterior
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _expected(result: BundleResult, freed: Posterior) -> tuple[Array, Array, Array]:
     """Motions (m, 6) of photos by their prior, and its standard deviations (m,) of phi and velocity, per frame."""
     rec, common = result.reconstruction, result.common
     own = np.array([result.phi_sigma, result.velocity_sigma * rec.baseline])

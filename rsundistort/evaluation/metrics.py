@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Solution
+from ..model.array_types import Array
 from ..model.checks import check_finite, check_kind, check_whole
 from ..model.similarity import similarity_of
 
@@ -33,8 +34,8 @@ class PoseErrors:
     """
 
     names: tuple[str, ...]
-    rotation_deg: NDArray[np.float64]
-    center: NDArray[np.float64]
+    rotation_deg: Array
+    center: Array
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,10 @@ class MotionErrors:
     """Errors of phi in radians per frame, (m, 3), of the photos that both sides have."""
 
     names: tuple[str, ...]
-    phi_rad_per_frame: NDArray[np.float64]
+    phi_rad_per_frame: Array
 
 
-def rotation_angles_deg(R: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_angles_deg(R: Array) -> Array:
     """Angles (m,) of rotation matrices (m, 3, 3); exact also for tiny ones."""
     vee = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     sine = np.linalg.norm(vee, axis=1) / 2
@@ -53,15 +54,13 @@ def rotation_angles_deg(R: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.degrees(np.arctan2(sine, cosine))
 
 
-def _best_rotation(moved: NDArray[np.float64]) -> NDArray[np.float64]:
+def _best_rotation(moved: Array) -> Array:
     """Rotation nearest to a 3x3 matrix."""
     U, _, Vt = np.linalg.svd(moved)
     return U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
 
 
-def align_points(
-    points: NDArray[np.float64], true_points: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+def align_points(points: Array, true_points: Array) -> tuple[float, Array, Array]:
     """Similarity that best takes points (n, 3) to the true ones in the least-squares sense, after Umeyama (1991).
 
     Returns

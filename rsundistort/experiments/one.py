@@ -282,12 +282,6 @@ def experiment_one(
     ----------
     scenes : sequence of path
         As `load_scene` takes them.
-    out : path
-        Folder.
-    options : OneOptions, optional
-        The protocol.
-    progress : callable, optional
-        Called as (stage, done, total).
 
     Returns
     -------

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..evaluation import align_points, pose_errors
 from ..model import Solution
+from ..model.array_types import Array
 
 __all__ = ["PathComparison", "compare_paths"]
 
@@ -38,11 +38,11 @@ class PathComparison:
     """
 
     names: tuple[str, ...]
-    still_w: NDArray[np.float64]
-    R_cw: NDArray[np.float64]
-    centers_w: Mapping[str, NDArray[np.float64]]
-    position: Mapping[str, NDArray[np.float64]]
-    rotation_deg: Mapping[str, NDArray[np.float64]]
+    still_w: Array
+    R_cw: Array
+    centers_w: Mapping[str, Array]
+    position: Mapping[str, Array]
+    rotation_deg: Mapping[str, Array]
 
 
 def compare_paths(still: Solution, with_model: Solution, without: Solution) -> PathComparison:
@@ -91,5 +91,5 @@ def compare_paths(still: Solution, with_model: Solution, without: Solution) -> P
     return PathComparison(tuple(names), still_w, R_cw, centers_w, position, rotation)
 
 
-def _centers(solution: Solution) -> NDArray[np.float64]:
+def _centers(solution: Solution) -> Array:
     return np.array([image.center_w for image in solution.images])

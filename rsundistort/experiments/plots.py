@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array
 from ..report.figures import need_matplotlib
 from .paths import PathComparison
 
@@ -64,7 +64,7 @@ def cumulative_histograms(entries: Sequence[Mapping[str, Any]], methods: Sequenc
     figure.savefig(path, dpi=130)
 
 
-def plan_axes(center_w: NDArray[np.float64], R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
+def plan_axes(center_w: Array, R_cw: Array) -> Array:
     """Two unit vectors (2, 3): right and up of a drawing that shows a camera path from where it varies least.
 
     Seen from above rather than from below (a mirrored path would mislead), rotated so that the cameras look up the

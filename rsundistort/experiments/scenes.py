@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError, InputError
 from ..io import read_colmap_poses
 from ..model import Camera
+from ..model.array_types import Array, Index
 from ..model.arrays import read_arrays
 from ..model.checks import check_finite, check_index, check_rotations, frozen
 
@@ -26,10 +26,6 @@ class KnownScene:
 
     Attributes
     ----------
-    name : str
-        For files and figures.
-    camera : Camera
-        Of all photos.
     R_cw, center_w : (m, 3, 3), (m, 3) array
         Poses in the order of the sequence; the mean distance of consecutive centres is 1.
     points_w : (n, 3) array
@@ -40,11 +36,11 @@ class KnownScene:
 
     name: str
     camera: Camera
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
-    points_w: NDArray[np.float64]
-    frame_idx: NDArray[np.int64]
-    point_idx: NDArray[np.int64]
+    R_cw: Array
+    center_w: Array
+    points_w: Array
+    frame_idx: Index
+    point_idx: Index
 
     def __post_init__(self) -> None:
         for name, dimensions in (("R_cw", 3), ("points_w", 2), ("frame_idx", 1)):  # whose lengths are taken

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..batch.progress import ProgressCallback
 from ..errors import InputError, ReconstructionError
@@ -18,6 +17,7 @@ from ..input.photo_cameras import camera_file_of
 from ..io import list_photos, output_folder
 from ..io.record import Record
 from ..model import Solution, check_shutter_model
+from ..model.array_types import Array
 from ..report.figures import need_matplotlib
 from ..solve import RunOptions, SolveOptions, run
 from ..solve.run_outputs import files_of_run
@@ -95,10 +95,6 @@ def experiment_two(
         Folders of photos with the same names, each pair taken from one place by one camera.
     out : path
         Folder for the outputs; it gets all of them or stays as it was.
-    options : TwoOptions, optional
-        See there.
-    progress : callable, optional
-        Called as (stage, done, total).
 
     Returns
     -------
@@ -148,7 +144,7 @@ def _within(progress: ProgressCallback, key: str) -> ProgressCallback:
     return lambda stage, done, total: progress(f"{key}: {stage}", done, total)
 
 
-def _spread(values: NDArray[np.float64]) -> dict[str, float]:
+def _spread(values: Array) -> dict[str, float]:
     return {"mean": float(np.mean(values)), "median": float(np.median(values)), "max": float(np.max(values))}
 
 

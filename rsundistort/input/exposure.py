@@ -28,8 +28,6 @@ def bounded_by_exposure(
 
     Parameters
     ----------
-    options : BundleOptions
-        Of the adjustments.
     reconstruction : Reconstruction
         The registered photos, and the distance of the scene.
     photos : LoadedPhotos

@@ -21,8 +21,6 @@ class PhotoSource:
 
     Attributes
     ----------
-    folder : Path
-        Of the photos.
     camera : str or None
         As `find_cameras` takes it.
     frames : VideoFrames or None

@@ -17,16 +17,15 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..io.gyro import GyroLog
+from ..model.array_types import Array, Index
 from ..model.checks import check_array, check_finite
 
 __all__ = ["GyroAlignment", "NoAlignment", "align_gyro", "check_pairs"]
-
-_Array = NDArray[np.float64]
 
 # Smallest number of rotations of an alignment, and the share of them that the log must cover.
 _FEWEST, _COVERED = 20, 0.6
@@ -84,15 +83,15 @@ class GyroAlignment:
 
     offset_s: float
     offset_sigma_s: float
-    camera_from_gyro: _Array
+    camera_from_gyro: Array
     axes: str | None
     also: tuple[str, ...]
-    axes_sigma_deg: _Array
-    bias: _Array
+    axes_sigma_deg: Array
+    bias: Array
     ratio: float
     ratio_sigma: float
     correlation: float
-    axis_correlations: _Array
+    axis_correlations: Array
     rms: float
     num_inliers: int
     num_rotations: int
@@ -161,8 +160,9 @@ def align_gyro(
         return NoAlignment("the camera, or its gyroscope, did not move at all")
     found = coarse.search(largest_s, around_s)
     if found is None:
+        within = f"within {largest_s:g} s of {around_s:g} s" if around_s else f"up to {largest_s:g} s"
         return NoAlignment(
-            f"no offset {_up_to(largest_s, around_s)} lets the gyroscope's log, from {log.time_s[0]:.2f} to "
+            f"no offset {within} lets the gyroscope's log, from {log.time_s[0]:.2f} to "
             f"{log.time_s[-1]:.2f} s, cover the frames"
         )
     offset, proper, mirrored, rival = found
@@ -187,7 +187,7 @@ def align_gyro(
     return fit
 
 
-def check_pairs(pairs: ArrayLike, rotations: ArrayLike) -> tuple[NDArray[np.int64], _Array]:
+def check_pairs(pairs: ArrayLike, rotations: ArrayLike) -> tuple[Index, Array]:
     """Pairs of frames (n, 2) and the rotations (n, 3) between them; other shapes and types are refused."""
     between = np.asarray(pairs)
     if between.ndim != 2 or between.shape[1] != 2 or not np.issubdtype(between.dtype, np.integer):
@@ -195,7 +195,7 @@ def check_pairs(pairs: ArrayLike, rotations: ArrayLike) -> tuple[NDArray[np.int6
     return between, check_array(rotations, (len(between), 3), "rotations")
 
 
-def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, rotations: ArrayLike) -> tuple[_Array, _Array, _Array]:
+def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, rotations: ArrayLike) -> tuple[Array, Array, Array]:
     """Start and end (n,) of intervals between frames, and the rates (n, 3) in them; without false ones."""
     times = check_finite(frame_time_s, (None,), "frame_time_s")
     between, vectors = check_pairs(pairs, rotations)
@@ -206,7 +206,7 @@ def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, rotations: ArrayLike) -> t
     return start[good], end[good], -vectors[good] / (end - start)[good, None]
 
 
-def _why_not(fit: GyroAlignment, way: _Array, spread: float, interval_s: float) -> str | None:
+def _why_not(fit: GyroAlignment, way: Array, spread: float, interval_s: float) -> str | None:
     """Reason against an alignment by the nearest signed permutation, where rates change by `spread`."""
     if fit.correlation < _LEAST_CORRELATION and spread < _STILL:
         return (
@@ -225,10 +225,6 @@ def _why_not(fit: GyroAlignment, way: _Array, spread: float, interval_s: float) 
     return None
 
 
-def _up_to(largest_s: float, around_s: float) -> str:
-    return f"within {largest_s:g} s of {around_s:g} s" if around_s else f"up to {largest_s:g} s"
-
-
 def _other_clip(correlation: float) -> str:
     return (
         f"the gyroscope's log does not show the camera's rotations (correlation {correlation:.2f}): it is of another "
@@ -236,7 +232,7 @@ def _other_clip(correlation: float) -> str:
     )
 
 
-def _without_jumps(seen: _Array, at_s: _Array, log: GyroLog, interval_s: float) -> _Array:
+def _without_jumps(seen: Array, at_s: Array, log: GyroLog, interval_s: float) -> Array:
     """Rates in which one that is unlike both its neighbours in time is their median, and none is beyond the log's."""
     order = np.argsort(at_s, kind="stable")
     padded = np.pad(seen[order], ((1, 1), (0, 0)), mode="edge")
@@ -254,11 +250,11 @@ class _Coarse:
     """Rates of the camera without jumps, against the log at any offset."""
 
     log: GyroLog
-    start: _Array
-    end: _Array
-    seen: _Array
+    start: Array
+    end: Array
+    seen: Array
 
-    def products(self, offset_s: float | _Array) -> tuple[_Array, _Array]:
+    def products(self, offset_s: float | Array) -> tuple[Array, Array]:
         """(..., 3, 3) of the rates of both without their means, over the root of their squares, and (...) their ratio.
 
         NaN if the log covers too little.
@@ -276,7 +272,7 @@ class _Coarse:
             scale = np.where(enough, of_a * of_b, np.nan)
             return a.swapaxes(-1, -2) @ b / scale[..., None, None], of_a / of_b
 
-    def correlations(self, offset_s: _Array) -> _Array:
+    def correlations(self, offset_s: Array) -> Array:
         """(k, 2) what the best rotation, and the best mirror image, reach; -inf where the log covers too little."""
         found = np.full((len(offset_s), 2), -np.inf)
         for first in range(0, len(offset_s), _AT_ONCE):
@@ -321,7 +317,7 @@ class _Coarse:
 # ---------------------------------------------------------------- which way it lies
 
 
-def _signed_permutations(*, mirrored: bool) -> list[_Array]:
+def _signed_permutations(*, mirrored: bool) -> list[Array]:
     """24 orientations of a sensor along the camera's axes, or their mirror images; the identity comes first."""
     ways = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
@@ -332,7 +328,7 @@ def _signed_permutations(*, mirrored: bool) -> list[_Array]:
     return ways
 
 
-def _ways(coarse: _Coarse, offset_s: float, seen: _Array, *, mirrored: bool) -> list[_Array]:
+def _ways(coarse: _Coarse, offset_s: float, seen: Array, *, mirrored: bool) -> list[Array]:
     """Orientations that the motion does not exclude: first the log's own axes if they are one, else the best."""
     measured = coarse.log.mean(coarse.start + offset_s, coarse.end + offset_s)
     there = np.isfinite(measured[:, 0])
@@ -348,13 +344,13 @@ def _ways(coarse: _Coarse, offset_s: float, seen: _Array, *, mirrored: bool) -> 
     return [ways[i] for i in sorted(allowed, key=lambda i: (i != 0 or mirrored, costs[i]))]
 
 
-def _letters(way: _Array) -> str:
+def _letters(way: Array) -> str:
     """The axes in the form that `parse_axes` reads."""
     columns = np.argmax(np.abs(way), axis=1)
     return "".join("XYZ"[k] if way[row, k] > 0 else "xyz"[k] for row, k in enumerate(columns))
 
 
-def _scale(sizes: _Array, measured: _Array, share: float = _SHARE) -> _Array:
+def _scale(sizes: Array, measured: Array, share: float = _SHARE) -> Array:
     """(n,) standard deviation of a rate per component, rad/s: the median residual, and a share of the rate."""
     noise = np.median(sizes) / 1.538  # median of the length of three normal numbers
     return np.hypot(max(noise, 1e-9), share * np.linalg.norm(measured - np.median(measured, axis=0), axis=1))
@@ -366,7 +362,7 @@ _ROTATION, _SHIFT, _RATIO, _OFFSET = slice(0, 3), slice(3, 6), 6, 7
 
 
 def _refine(
-    log: GyroLog, start: _Array, end: _Array, seen: _Array, offset_s: float, way: _Array, ratio: float
+    log: GyroLog, start: Array, end: Array, seen: Array, offset_s: float, way: Array, ratio: float
 ) -> GyroAlignment | None:
     """Gauss-Newton on rotation, bias, ratio and offset, with Cauchy's loss; the axes are not named.
 

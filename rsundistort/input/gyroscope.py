@@ -90,11 +90,7 @@ def known_readouts(
 
 
 def gyro_motions(
-    folder: Path,
-    gyro: GyroOptions,
-    log: GyroLog,
-    readout_s: Mapping[str, float | None],
-    cameras: Mapping[str, Camera],
+    folder: Path, gyro: GyroOptions, log: GyroLog, readout_s: Mapping[str, float | None], cameras: Mapping[str, Camera]
 ) -> tuple[Known, dict[str, Bend]]:
     """Motions of the photos that have a time, as `RunOptions.known` and `known_bends` take them.
 

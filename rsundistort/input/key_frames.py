@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, RsUndistortWarning
 from ..io.video import FrameWriter, VideoFrames, VideoReader, converted, frame_name, sharpness_of
+from ..model.array_types import Array, Index, Mask
 from ..model.track import ShownFrames, usual_step
 from ..sfm.flow import FlowFrame, KeyFlow, KeyFrameChooser, flow_size
 
@@ -57,8 +58,6 @@ class Clip:
 
     Attributes
     ----------
-    video : Path
-        The file.
     folder : Path
         Where its key frames lie, as PNG files.
     numbers : tuple of int, length n
@@ -89,10 +88,10 @@ class Clip:
     folder: Path
     numbers: tuple[int, ...]
     names: tuple[str, ...]
-    time_s: NDArray[np.float64]
+    time_s: Array
     frame_s: float
-    part: NDArray[np.int64]
-    keys: NDArray[np.int64]
+    part: Index
+    keys: Index
     frames: VideoFrames
     flows: tuple[KeyFlow, ...] = ()
     repeated: tuple[int, ...] = ()
@@ -103,12 +102,12 @@ class Clip:
         """Names of the key frames."""
         return tuple(self.names[k] for k in self.keys.tolist())
 
-    def are_keys(self, names: Sequence[str]) -> NDArray[np.bool_]:
+    def are_keys(self, names: Sequence[str]) -> Mask:
         """(m,) which of these frames are key frames."""
         keys = {*self.key_names}
         return np.array([name in keys for name in names], bool)
 
-    def with_gaps(self, missing: NDArray[np.int64], frame_s: float) -> Clip:
+    def with_gaps(self, missing: Index, frame_s: float) -> Clip:
         """The same frames where so many (n - 1,) are missing between them, and those of a part `frame_s` apart."""
         step_s = np.diff(self.time_s)
         step_s = np.where(np.diff(self.part) == 0, frame_s * (step_s / self.frame_s + missing), step_s)
@@ -121,7 +120,7 @@ class Clip:
         step_s = np.diff(self.time_s)[np.diff(self.part) == 0]
         return bool((step_s < 1.5 * self.frame_s).all())
 
-    def places(self, names: Sequence[str]) -> NDArray[np.int64]:
+    def places(self, names: Sequence[str]) -> Index:
         """(m,) which of its frames have these names."""
         number = {name: k for k, name in enumerate(self.names)}
         return np.array([number[name] for name in names], np.int64)
@@ -270,9 +269,7 @@ class _Step:
         self._sizes.clear()
 
 
-def _with_repeated(
-    video: Path, numbers: NDArray[np.int64], time_s: NDArray[np.float64], num_repeated: int
-) -> NDArray[np.float64]:
+def _with_repeated(video: Path, numbers: Index, time_s: Array, num_repeated: int) -> Array:
     """The times (n,) of frames where so many others showed the same as the one before."""
     if not num_repeated:
         return time_s
@@ -286,7 +283,7 @@ def _with_repeated(
     return time_s if step_s is None else time_s[0] + step_s * np.arange(len(time_s))
 
 
-def _even_step(numbers: NDArray[np.int64], time_s: NDArray[np.float64]) -> float | None:
+def _even_step(numbers: Index, time_s: Array) -> float | None:
     """Time from frame to frame before a conversion to a higher frame rate repeated some; None if it was none.
 
     Indices of the others (n,) after a conversion are the multiples of the ratio of both rates, rounded.

@@ -55,14 +55,8 @@ class LoadedPhotos:
         Readable photos, their features and EXIF.
     skipped : dict of name to reason
         Unreadable ones.
-    cameras : PhotoCameras
-        The camera of each.
     orientations : mapping of name to int
         Their EXIF orientations.
-    folder : Path
-        Where they are.
-    mask_of : mapping of name to Path
-        Their masks.
     max_megapixels : float
         As in `RectifyOptions`.
     edges_px : sequence of float or None
@@ -212,16 +206,8 @@ def load_photos(
 
     Parameters
     ----------
-    folder : Path
-        Of the photos.
     camera, readout
         As in `find_cameras`.
-    max_features : int
-        Of a photo.
-    workers : Workers
-        Where it is done.
-    log : StageLog
-        Gets the progress.
     megapixels : float
         As in `detect_features`.
     masks, raw_as, again, max_megapixels
@@ -230,8 +216,6 @@ def load_photos(
         Smallest number of photos, two or three.
     only : sequence of str, optional
         Photos that are loaded; all that are there when left out.
-    kept : Kept, optional
-        Results of an earlier run; takes those of this run.
     coarse : bool
         Whether fewer pixels are enough for the features of photos that show many there.
     """
@@ -273,15 +257,7 @@ def with_finer_features(
     megapixels: float,
     kept: Kept | None = None,
 ) -> LoadedPhotos:
-    """Photos with features of all pixels that are allowed, where they were loaded with coarse ones.
-
-    Parameters
-    ----------
-    photos : LoadedPhotos
-        Of `load_photos`.
-    max_features, workers, log, megapixels, kept
-        As there.
-    """
+    """Photos with features of all pixels that are allowed, where they were loaded with coarse ones."""
     limits = max_features, megapixels, photos.max_megapixels
     jobs = [
         _LoadJob(name, photos.folder / name, photos.mask_of.get(name), *limits, again=True, coarse=False)

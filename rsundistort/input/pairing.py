@@ -7,9 +7,9 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..io import ExifFacts
+from ..model.array_types import Array, Index
 from ..sfm import choose_pairs, global_descriptors
 from .load import LoadedPhotos
 
@@ -25,7 +25,7 @@ _RETURNS, _SEEN_AGAIN_BY = 3, 256
 _EARTH_RADIUS_M = 6371e3
 
 
-def pairs_to_match(photos: LoadedPhotos, matching: str, seed: int) -> NDArray[np.int64] | None:
+def pairs_to_match(photos: LoadedPhotos, matching: str, seed: int) -> Index | None:
     """Pairs of neighbours in the order of capture, by GPS or by appearance; None for all pairs."""
     num_photos = len(photos.names)
     if matching == "exhaustive" or (matching == "auto" and num_photos <= _EXHAUSTIVE_TO):
@@ -38,7 +38,7 @@ def pairs_to_match(photos: LoadedPhotos, matching: str, seed: int) -> NDArray[np
     )
 
 
-def pairs_of_clip(keys: LoadedPhotos, matching: str, seed: int) -> NDArray[np.int64] | None:
+def pairs_of_clip(keys: LoadedPhotos, matching: str, seed: int) -> Index | None:
     """Pairs of key frames of a video, in its order; None for all.
 
     Each is matched with those 1, 2, 4, 8, ... further on, as long as the video: tracks connect what lies between, and
@@ -53,9 +53,7 @@ def pairs_of_clip(keys: LoadedPhotos, matching: str, seed: int) -> NDArray[np.in
     return choose_pairs(num, descriptors=global_descriptors(largest, seed), given=ahead, similar=_RETURNS)
 
 
-def capture_sequences(
-    names: Sequence[str], camera_idx: NDArray[np.int64], facts: Sequence[ExifFacts]
-) -> list[NDArray[np.int64]]:
+def capture_sequences(names: Sequence[str], camera_idx: Index, facts: Sequence[ExifFacts]) -> list[Index]:
     """The photos of each camera in the order of capture: by its clock, else by the numbers in their names.
 
     Clocks of several cameras differ, so each has a sequence of its own. If photos of a camera lack a time, only the
@@ -76,7 +74,7 @@ def _natural(name: str) -> tuple[tuple[int, str], ...]:
     return (*((int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)), (-1, name))
 
 
-def places_of(facts: Sequence[ExifFacts]) -> NDArray[np.float64]:
+def places_of(facts: Sequence[ExifFacts]) -> Array:
     """(m, 3) places by GPS at sea level, metres from the centre of the Earth; NaN where a photo has none."""
     latitude, longitude = np.deg2rad([fact.place_deg or (np.nan, np.nan) for fact in facts]).T
     return _EARTH_RADIUS_M * np.column_stack(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..batch.workers import Workers
 from ..errors import FileError
 from ..io import read_mask, read_photo
+from ..model.array_types import Mask
 from ..sfm import PatchPlaces, PatchSource, allowed_patches, cut_patches, grey_8_bit
 from .load import LoadedPhotos
 
@@ -33,7 +34,7 @@ class _PatchJob:
     places: PatchPlaces
 
 
-def _cut(job: _PatchJob) -> tuple[NDArray[np.uint8], NDArray[np.bool_]] | None:
+def _cut(job: _PatchJob) -> tuple[NDArray[np.uint8], Mask] | None:
     """Patches, and which of them the mask allows; None if the photo can no longer be read."""
     try:
         pixels = read_photo(job.source, job.max_megapixels).pixels
@@ -51,9 +52,7 @@ def patch_source(
     most = max(camera.width * camera.height for camera in photos.cameras.cameras)
     fitting = workers.fitting("alignment", _BYTES_PER_PIXEL * most)
 
-    def patches_of(
-        places: Mapping[int, PatchPlaces],
-    ) -> Iterator[tuple[int, NDArray[np.uint8], NDArray[np.bool_]]]:
+    def patches_of(places: Mapping[int, PatchPlaces]) -> Iterator[tuple[int, NDArray[np.uint8], Mask]]:
         jobs = [
             _PatchJob(
                 frame, photos.folder / names[frame], photos.mask_of.get(names[frame]), photos.max_megapixels, each

@@ -8,21 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, GuessedCameras, deviation, pixels_of
 from ..bundle.intrinsics import check_lenses
 from ..errors import InputError, ReconstructionError
-from ..io import (
-    CameraFile,
-    ExifFacts,
-    camera_from_exif,
-    check_camera_fits,
-    group_of,
-    guess_readouts,
-    read_camera_file,
-)
+from ..io import CameraFile, ExifFacts, camera_from_exif, check_camera_fits, group_of, guess_readouts, read_camera_file
 from ..model import Camera, check_readout
+from ..model.array_types import Index
 from ..sfm import USUAL_FOCAL
 
 __all__ = ["GIVEN_SIGMA", "GUESS_SIGMA", "PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
@@ -30,9 +22,7 @@ __all__ = ["GIVEN_SIGMA", "GUESS_SIGMA", "PhotoCameras", "camera_file_of", "chec
 #: Standard deviations of EXIF's guess (relative f, principal point in focal lengths, lens coefficients): equivalent
 #: focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort, and lenses
 #: are hardly decentred (p1 and p2 trade against cx, cy and a phi3 that all photos share).
-GUESS_SIGMA = {
-    "f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "k4": 0.4, "p1": 1e-3, "p2": 1e-3
-}  # fmt: skip
+GUESS_SIGMA = {"f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "k4": 0.4, "p1": 1e-3, "p2": 1e-3}
 #: Standard deviations of a calibration: published ones of good cameras were off by half a pixel.
 GIVEN_SIGMA = {
     "f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "k2": 1e-2, "k3": 1e-2, "k4": 1e-2, "p1": 3e-4, "p2": 3e-4
@@ -77,7 +67,7 @@ class PhotoCameras:
 
     cameras: Sequence[Camera]
     labels: Sequence[str]
-    camera_idx: NDArray[np.int64]
+    camera_idx: Index
     calibrated: bool
     readout_specified: tuple[bool, ...]
     source: str
@@ -207,8 +197,6 @@ def find_cameras(
 
     Parameters
     ----------
-    folder : Path
-        Of the photos.
     names, sizes, facts : sequences of length m
         Photos, their (width, height) and what their EXIF says.
     camera : str, optional

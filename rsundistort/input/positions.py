@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io import ExifFacts
 from ..io.photos.gps import ALTITUDES
+from ..model.array_types import Array
 from ..model.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic
 
 __all__ = ["MapFrame", "PhotoPositions", "check_crs", "frame_at", "frame_of_control", "positions_of"]
-
-Array = NDArray[np.float64]
 
 # Altitudes of one photo that differ by more are of two datums, metres.
 _ANOTHER_DATUM_M = 1.0
@@ -44,8 +42,6 @@ class PhotoPositions:
 
     Attributes
     ----------
-    names : list of str
-        The photos.
     geodetic : (m, 3) array
         Latitude and longitude in degrees, altitude in metres as in the photos.
     sigma_m : (m, 3) array
@@ -58,8 +54,6 @@ class PhotoPositions:
         From axes east, north and up to those of the camera, by its gimbal; NaN where unknown.
     sigma_from : tuple of str
         Source of the standard deviations.
-    notes : tuple of str
-        Remarks on them.
     common_up_m : float
         Standard deviation of an error that all altitudes share, which `sigma_m` does not contain.
     """
@@ -91,8 +85,6 @@ class MapFrame:
         Of "local" latitude, longitude and altitude; else what is subtracted from east, north and up.
     convergence_rad : float
         By how much east and north are rotated in the frame, counter-clockwise: a grid's north is not the north pole's.
-    note : str
-        A remark on it.
     """
 
     crs: str

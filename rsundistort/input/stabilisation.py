@@ -19,12 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..io.gyro import GyroLog
+from ..model.array_types import Array
 from ..model.checks import check_array, check_finite
 from .gyro_alignment import check_pairs
 
 __all__ = ["Regression", "Stabilisation", "calmer_than_felt", "judge_stabilisation"]
-
-_Array = NDArray[np.float64]
 
 # Of the time from frame to frame: no rolling shutter is read faster (0.2 of 1/60 s; `io.readout_times`), none slower,
 # but rates between frames miss up to a third of a tremor that is nearly as fast as they can show.
@@ -193,9 +192,7 @@ def judge_stabilisation(
     return replace(found, verdict=verdict, reason=reason, read_at_once=at_once and not found.shows_shaking)
 
 
-def _of_lines(
-    phi: _Array, rate: _Array, noise: _Array, interval: float
-) -> tuple[Regression, Regression, bool]:  # fmt: skip
+def _of_lines(phi: Array, rate: Array, noise: Array, interval: float) -> tuple[Regression, Regression, bool]:
     """Phi (m, 3) by the rate, its changes by those of the rate, and whether these exceed those of whole frames.
 
     What is in no rotation shows in changes alone: what lens and scene leave in phi is slow. Where it is more than
@@ -246,13 +243,13 @@ def calmer_than_felt(
     )
 
 
-def _noise(sigma: ArrayLike, values: _Array, name: str) -> _Array:
+def _noise(sigma: ArrayLike, values: Array, name: str) -> Array:
     """(n, 3) standard deviations of values, from those or one for all."""
     given = np.asarray(sigma, np.float64)
     return np.broadcast_to(given, values.shape) if given.ndim == 0 else check_array(given, values.shape, name)
 
 
-def _rate_at_frames(rate: _Array, pairs: NDArray[np.integer], num_frames: int) -> _Array:
+def _rate_at_frames(rate: Array, pairs: NDArray[np.integer], num_frames: int) -> Array:
     """(m, 3) rate when each frame was read, from the mean rates between frames; NaN where a neighbour is unknown.
 
     Means over the time between frames are smoother than the rate: with two on each side the value at the frame is that
@@ -266,11 +263,11 @@ def _rate_at_frames(rate: _Array, pairs: NDArray[np.integer], num_frames: int) -
     far = np.where((earlier >= 0)[:, None], before[earlier], np.nan) + np.where(
         (later >= 0)[:, None], after[later], np.nan
     )
-    cubic: _Array = (7 * near - far) / 12
+    cubic: Array = (7 * near - far) / 12
     return np.where(np.isfinite(cubic), cubic, near / 2)
 
 
-def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False, together: int = 1) -> Regression:
+def _regress(y: Array, x: Array, noise: Array, *, steady: bool = False, together: int = 1) -> Regression:
     """`y = slope x` with a robust loss; without the means of both where a steady difference (a bias) says nothing.
 
     So many neighbours may be off together.

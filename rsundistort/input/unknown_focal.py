@@ -31,19 +31,7 @@ _WEAK = 0.2
 
 
 def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kept | None = None) -> LoadedPhotos:
-    """The photos with focal lengths from their matches, where no other source gives them, and a note on that.
-
-    Parameters
-    ----------
-    photos : LoadedPhotos
-        Features and cameras.
-    seed : int
-        Seed of every random choice.
-    log : StageLog
-        Gets the progress.
-    kept : Kept, optional
-        Results of an earlier run; takes those of this run.
-    """
+    """The photos with focal lengths from their matches, where no other source gives them, and a note on that."""
     cameras, kept = photos.cameras, kept or Kept()
     if not cameras.without_focal:
         return photos
@@ -52,9 +40,7 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
     found = {k: before.get(str(k)) or _focal_length(photos, k, seed) for k in cameras.without_focal}
     kept.put("focal lengths", {str(k): each for k, each in found.items()})
     log.end(
-        "focal length",
-        pixels=[each.pixels for each in found.values()],
-        sigma=[each.sigma for each in found.values()],
+        "focal length", pixels=[each.pixels for each in found.values()], sigma=[each.sigma for each in found.values()]
     )
     new, sigma, said = list(cameras.cameras), [dict(each) for each in cameras.sigma], []
     for k, focal in found.items():

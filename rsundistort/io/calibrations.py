@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import format_errors
 from ..model import Camera
+from ..model.array_types import Array
 from .xml_text import parse_xml as parse_elements
 
 __all__ = ["camera_from_calibration", "has_size", "is_calibration", "kalibr_cameras", "parse_xml", "parse_yaml"]
@@ -130,7 +130,7 @@ def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, hei
         return Camera(width, height, K, dist, lens=lens)
 
 
-def _matrix(fields: Mapping[str, Any]) -> NDArray[np.float64]:
+def _matrix(fields: Mapping[str, Any]) -> Array:
     """The nine numbers of K."""
     if not any(name in fields for name in _MATRIX):
         four = _numbers(fields.get("intrinsics"))
@@ -164,7 +164,7 @@ def _first(fields: Mapping[str, Any], names: tuple[str, ...]) -> Any:
     return next((fields[name] for name in names if name in fields), None)
 
 
-def _numbers(value: Any) -> NDArray[np.float64]:
+def _numbers(value: Any) -> Array:
     """The numbers of a matrix, of lists, or of a text; none of nothing."""
     if isinstance(value, Mapping):
         value = value.get("data")
@@ -195,9 +195,7 @@ def _size(fields: Mapping[str, Any], width: int, height: int) -> tuple[int, int]
     return int(given[0]), int(given[1])
 
 
-def _read_out(
-    fields: Mapping[str, Any], width: int, height: int, K: NDArray[np.float64]
-) -> tuple[int, int, NDArray[np.float64]]:
+def _read_out(fields: Mapping[str, Any], width: int, height: int, K: Array) -> tuple[int, int, Array]:
     """Size and matrix of the pixels that a ROS driver hands out: the region of interest, then binned."""
     roi = _fields(fields["roi"]) if isinstance(fields.get("roi"), Mapping) else {}
     binning = np.maximum([_whole(fields, "binningx"), _whole(fields, "binningy")], 1)
@@ -210,7 +208,7 @@ def _read_out(
     return int(size[0]), int(size[1]), K
 
 
-def _distortion(fields: Mapping[str, Any]) -> tuple[NDArray[np.float64], str]:
+def _distortion(fields: Mapping[str, Any]) -> tuple[Array, str]:
     """Coefficients and lens model."""
     if not any(name in fields for name in _DISTORTION):
         for name in fields:  # a lens lost to a misspelling would be missed by nobody

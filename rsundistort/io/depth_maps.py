@@ -26,8 +26,6 @@ def find_depth_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     ----------
     folder : Path
         Of NumPy arrays (.npy, .npz) or float TIFFs. A photo need not have one.
-    names : sequence of str
-        Photos.
 
     Raises
     ------

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
+from ..model.array_types import Array
 from ..model.projection import project_points, unproject_points
 from ..model.track import CameraTrack
 
@@ -76,14 +77,14 @@ class ExportScene:
         return np.zeros((self.reconstruction.num_points, 3), np.uint8) if self.rgb is None else self.rgb
 
 
-def euler_deg(rotations: NDArray[np.float64], order: Literal["XYZ", "zxy"]) -> NDArray[np.float64]:
+def euler_deg(rotations: Array, order: Literal["XYZ", "zxy"]) -> Array:
     """(..., 3) Euler angles of matrices (..., 3, 3), degrees; where two axes fall together, the third angle is zero."""
     with warnings.catch_warnings():  # gimbal lock: the angles given stand for the matrix all the same, to 1e-9
         warnings.simplefilter("ignore", UserWarning)
         return np.asarray(np.degrees(Rotation.from_matrix(rotations).as_euler(order)))
 
 
-def _places(camera: Camera) -> NDArray[np.float64]:
+def _places(camera: Camera) -> Array:
     """Pixels all over a photo, border to border."""
     across, down = (np.linspace(-0.5, side - 0.5, _LOOKED_AT) for side in (camera.width, camera.height))
     return np.stack(np.meshgrid(across, down), axis=2).reshape(-1, 2)

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FormatError, RsUndistortError, RsUndistortWarning, format_errors
+from ..model.array_types import Array
 from .ffmpeg_reasons import open_video
 from .gyro import CAMERA_FROM_GYROFLOW, GyroLog, parse_axes
 
@@ -58,14 +58,14 @@ class _Item:
     def text(self) -> str:
         return bytes(self.data).split(b"\0")[0].decode("latin-1").strip()
 
-    def numbers(self) -> NDArray[np.float64]:
+    def numbers(self) -> Array:
         """Whole numbers that are there; none of a type that holds no numbers."""
         dtype = np.dtype(_DTYPES.get(self.kind, "V1"))
         if dtype.kind == "V":
             return np.zeros(0)
         return np.frombuffer(self.data, dtype, len(self.data) // dtype.itemsize).astype(np.float64)
 
-    def rows(self) -> NDArray[np.float64]:
+    def rows(self) -> Array:
         """(n, 3) whole samples; none where a sample is not three numbers."""
         numbers = self.numbers()
         if not len(numbers) or self.sample_bytes != 3 * np.dtype(_DTYPES[self.kind]).itemsize:
@@ -83,8 +83,6 @@ class GyroPayload:
         rad/s, in the order in which they are stored.
     orientation : (3, 3) array
         Takes `rates` to the camera's axes: right, down, ahead.
-    device : str
-        Name of the device.
     num_before : int or None
         Samples that the camera took before these (TSMP).
     stamp_s, frame_stamp_s : float or None
@@ -97,8 +95,8 @@ class GyroPayload:
         What could not be read.
     """
 
-    rates: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
-    orientation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    rates: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    orientation: Array = field(default_factory=lambda: np.eye(3))
     device: str = ""
     num_before: int | None = None
     stamp_s: float | None = None
@@ -233,9 +231,7 @@ def _global_readout(path: Path) -> float | None:
 # ---------------------------------------------------------------- times
 
 
-def _sample_times(
-    payloads: list[GyroPayload], start_s: NDArray[np.float64], length_s: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], bool]:
+def _sample_times(payloads: list[GyroPayload], start_s: Array, length_s: Array) -> tuple[Array, bool]:
     """Times of all samples, and whether payloads are too far from uniform times to be believed uniform."""
     count = np.array([len(payload.rates) for payload in payloads])
     counted = np.cumsum(count) - count
@@ -258,7 +254,7 @@ def _sample_times(
     return np.interp(index, *knots) - payloads[0].delay_s, True
 
 
-def _first_times(payloads: list[GyroPayload], start_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def _first_times(payloads: list[GyroPayload], start_s: Array) -> Array:
     """Times of the first samples by the camera's own stamps; the file's where these are missing or contradict it."""
     if len(payloads) < 2 or any(payload.stamp_s is None for payload in payloads):
         return start_s
@@ -349,7 +345,7 @@ def _gyroscope(stream: dict[str, _Item], device: str, problems: list[str]) -> Gy
     )
 
 
-def _orientation(stream: dict[str, _Item], device: str, problems: list[str]) -> NDArray[np.float64]:
+def _orientation(stream: dict[str, _Item], device: str, problems: list[str]) -> Array:
     """(3, 3) from the order of storage to the camera's axes: by the letters of ORIN, or by what is known."""
     letters = stream["ORIN"].text() if "ORIN" in stream else _SILENT.get(device, _OUT)
     if sorted(letters.upper()) != ["X", "Y", "Z"]:

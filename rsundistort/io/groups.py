@@ -43,10 +43,7 @@ def _body(facts: ExifFacts) -> str:
 
 
 def guess_readouts(
-    facts: Sequence[ExifFacts],
-    sizes: Sequence[tuple[int, int]],
-    groups: Sequence[str],
-    readout: str = "top-to-bottom",
+    facts: Sequence[ExifFacts], sizes: Sequence[tuple[int, int]], groups: Sequence[str], readout: str = "top-to-bottom"
 ) -> tuple[dict[str, str], list[str]]:
     """Readout direction of each group of a mixed folder, and what to say of it.
 

@@ -16,10 +16,11 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import FormatError, InputError, RsUndistortWarning, file_errors, format_errors
 from ..model import Bend, Camera, RowMotion
+from ..model.array_types import Array, Index, Mask
 from ..model.checks import check_array, check_finite, frozen
 from .motions import Known
 from .tables import check_cells, check_columns, read_table
@@ -65,8 +66,8 @@ class GyroLog:
         Time of the readout of a frame, where the log says it.
     """
 
-    time_s: NDArray[np.float64]
-    omega_c: NDArray[np.float64]
+    time_s: Array
+    omega_c: Array
     readout_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -82,18 +83,18 @@ class GyroLog:
         return float(np.median(np.diff(self.time_s)))
 
     @property
-    def noise(self) -> NDArray[np.float64]:
+    def noise(self) -> Array:
         """(3,) standard deviation in rad/s of a sample, from second differences: fast shaking counts as noise."""
         second = np.abs(np.diff(self.omega_c, n=2, axis=0))
         # second differences of independent samples have six times their variance; 0.6745: median of |x| of a normal x
         return np.median(second, axis=0) / (0.6745 * np.sqrt(6.0)) if len(second) else np.zeros(3)
 
-    def mean(self, start_s: NDArray[np.float64], end_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def mean(self, start_s: Array, end_s: Array) -> Array:
         """(..., 3) mean rates between times, linear between samples; NaN outside the log and across a gap in it."""
         rate = (self._angle(end_s) - self._angle(start_s)) / (end_s - start_s)[..., None]
         return np.where(self._covers(start_s, end_s)[..., None], rate, np.nan)
 
-    def rotations(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rotations(self, at_s: Array) -> Array:
         """(k, 3) rotation vectors of the world in the camera at times (k,), against the first of them.
 
         `Exp(rotation) R_cw` is the orientation then, R_cw that at the first time. Between neighbouring times the axis
@@ -109,34 +110,34 @@ class GyroLog:
         return np.asarray(rotations.as_rotvec(), np.float64)
 
     @cached_property
-    def _angle_before(self) -> NDArray[np.float64]:
+    def _angle_before(self) -> Array:
         """(n, 3) integral of the rates from the first sample to each."""
         step = np.diff(self.time_s)[:, None]
         return np.vstack([np.zeros(3), np.cumsum(0.5 * step * (self.omega_c[1:] + self.omega_c[:-1]), axis=0)])
 
     @cached_property
-    def _gaps_before(self) -> NDArray[np.int64]:
+    def _gaps_before(self) -> Index:
         """(n,) number of gaps before each sample."""
         return np.concatenate([[0], np.cumsum(np.diff(self.time_s) > _GAP_STEPS * self.step_s)])
 
-    def _angle(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _angle(self, at_s: Array) -> Array:
         """(..., 3) integral of the rates from the first sample."""
         i = np.clip(np.searchsorted(self.time_s, at_s, side="right") - 1, 0, len(self.time_s) - 2)
         passed = (at_s - self.time_s[i])[..., None]
         slope = (self.omega_c[i + 1] - self.omega_c[i]) / (self.time_s[i + 1] - self.time_s[i])[..., None]
-        angle: NDArray[np.float64] = self._angle_before[i] + passed * (self.omega_c[i] + 0.5 * passed * slope)
+        angle: Array = self._angle_before[i] + passed * (self.omega_c[i] + 0.5 * passed * slope)
         return angle
 
-    def _covers(self, start_s: NDArray[np.float64], end_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def _covers(self, start_s: Array, end_s: Array) -> Mask:
         gaps = self._gaps_before
         first = np.searchsorted(self.time_s, start_s, side="right") - 1  # the sample before, and the one after
         last = np.searchsorted(self.time_s, end_s, side="left")
         inside = (first >= 0) & (last < len(self.time_s))
-        covers: NDArray[np.bool_] = inside & (gaps[np.clip(first, 0, None)] == gaps[np.clip(last, None, len(gaps) - 1)])
+        covers: Mask = inside & (gaps[np.clip(first, 0, None)] == gaps[np.clip(last, None, len(gaps) - 1)])
         return covers
 
 
-def parse_axes(text: str) -> NDArray[np.float64]:
+def parse_axes(text: str) -> Array:
     """(3, 3) matrix that takes a sensor's rates to other axes, from three letters such as "XYZ" or "yXZ".
 
     The k-th letter names the axis of the sensor that lies along the k-th axis wanted; a small one points the other way.
@@ -212,9 +213,7 @@ def _from_gcsv(path: Path, lines: list[str], axes: str | None) -> GyroLog:
     return _log(path, tscale * time, gscale * counts @ to_camera.T, readout_s if readout_s > 0 else None)
 
 
-def _samples(
-    path: Path, lines: list[str], start: int, columns: list[int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _samples(path: Path, lines: list[str], start: int, columns: list[int]) -> tuple[Array, Array]:
     """Times (n,) and rates (n, 3) as written, behind the line of the columns, without a last line that was cut off."""
     body = lines[start:]
     width = lines[start - 1].count(",") + 1
@@ -239,9 +238,7 @@ def _samples(
     return table[:, 0], table[:, 1:]
 
 
-def _log(
-    path: Path, time_s: NDArray[np.float64], omega_c: NDArray[np.float64], readout_s: float | None = None
-) -> GyroLog:
+def _log(path: Path, time_s: Array, omega_c: Array, readout_s: float | None = None) -> GyroLog:
     """A log in which samples that were written with one time are one, their mean."""
     times, index, count = np.unique(time_s, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(index, omega_c[:, k]) for k in range(3)], axis=1) / count[:, None]
@@ -289,8 +286,6 @@ def motions_from_gyro(
 
     Parameters
     ----------
-    log : GyroLog
-        Of the camera.
     times_s : mapping of photo name to float
         When the middle line of each photo was read, by the camera's clock.
     readout_s : float, or mapping of photo name to float
@@ -355,7 +350,7 @@ def bends_from_gyro(
     cameras: Mapping[str, Camera],
     *,
     offset_s: float = 0.0,
-) -> dict[str, tuple[NDArray[np.float64], Bend]]:
+) -> dict[str, tuple[Array, Bend]]:
     """How photos rotated while they were read: the nearest steady motion, and how the rotation departs from it.
 
     Parameters
@@ -387,25 +382,16 @@ def bends_from_gyro(
 
 
 def gyro_offset(
-    log: GyroLog,
-    times_s: ArrayLike,
-    phi_frame: ArrayLike,
-    readout_s: float,
-    *,
-    largest_s: float = 10.0,
+    log: GyroLog, times_s: ArrayLike, phi_frame: ArrayLike, readout_s: float, *, largest_s: float = 10.0
 ) -> tuple[float, float]:
     """The offset of a log's clock, from motions that were solved for without it.
 
     Parameters
     ----------
-    log : GyroLog
-        Of the camera.
     times_s : (m,) array
         When the middle lines of photos were read, by the camera's clock.
     phi_frame : (m, 3) array
         Their rotations in radians per frame: `image.motion.phi * camera.frame_span` of a solution.
-    readout_s : float
-        Time of the readout of a frame.
     largest_s : float
         Offsets of either sign up to this are tried.
 

@@ -26,8 +26,6 @@ class JournalEntry:
 
     Attributes
     ----------
-    name : str
-        Of the photo.
     fingerprint : str
         Of what they were made of, and how.
     files : mapping of path in the folder of outputs to int

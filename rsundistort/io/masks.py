@@ -39,8 +39,6 @@ def find_masks(
     ----------
     folder : Path or RemoteFolder
         Of the masks. A photo need not have one.
-    names : sequence of str
-        Photos.
     what : str
         What errors call them; other files of the same frames are found alike.
     suffixes : sequence of str

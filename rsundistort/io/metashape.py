@@ -21,11 +21,11 @@ from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.lenses import FIT_PX, nearest_camera
 from ..errors import FormatError, InputError, RsUndistortWarning, format_errors
 from ..model import Camera
+from ..model.array_types import Array, Index
 from ..model.checks import check_rotations
 from .export_scene import ExportScene
 from .xml_text import read_xml
@@ -60,8 +60,8 @@ class ShutterTerms:
         In the camera's axes, in the units of the centres; zero where the file has none.
     """
 
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
+    rotation: Array
+    translation: Array
 
     @property
     def angle_deg(self) -> float:
@@ -113,9 +113,9 @@ class PosedPhotos:
     labels: tuple[str, ...]
     cameras: tuple[Camera, ...]
     camera_ids: tuple[int, ...]
-    camera_idx: NDArray[np.int64]
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
+    camera_idx: Index
+    R_cw: Array
+    center_w: Array
     unposed: tuple[str, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     shutter: Mapping[int, ShutterTerms] = field(default_factory=dict)
@@ -194,7 +194,7 @@ def _shutter_terms(element: ElementTree.Element, scale: float, where: str) -> Sh
     )
 
 
-def _near(center_w: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+def _near(center_w: Array, where: str) -> Array:
     """Centres about an origin that is not far from them."""
     if not len(center_w):
         return center_w
@@ -208,7 +208,7 @@ def _near(center_w: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     return center_w - middle
 
 
-def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[NDArray[np.float64], float]:
+def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[Array, float]:
     """The (4, 4) similarity of a chunk's coordinates, and its scale; none where there is no scale."""
     matrix, scale = np.eye(4), 1.0
     if transform is None or not len(transform):
@@ -224,7 +224,7 @@ def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[NDArra
     return matrix, scale
 
 
-def _numbers(element: ElementTree.Element, count: int, where: str) -> NDArray[np.float64]:
+def _numbers(element: ElementTree.Element, count: int, where: str) -> Array:
     with format_errors(where, ValueError):
         found = np.array((element.text or "").split(), np.float64)
     if len(found) != count or not np.isfinite(found).all():
@@ -275,9 +275,7 @@ def _camera(sensor: Sensor, width: int, height: int, where: str) -> Camera:
     return camera
 
 
-def _pixels(
-    p: Mapping[str, float], fisheye: bool, width: int, height: int, rays: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _pixels(p: Mapping[str, float], fisheye: bool, width: int, height: int, rays: Array) -> Array:
     """Pixels with integer centres of normalized coordinates (n, 2), by the camera models of Metashape's manual."""
     x, y = np.asarray(rays, np.float64).T
     if fisheye:
@@ -295,9 +293,7 @@ def _pixels(
     return np.column_stack([u, height / 2 + p["cy"] + y * p["f"]]) - 0.5
 
 
-def _rays_and_pixels(
-    p: Mapping[str, float], fisheye: bool, width: int, height: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rays_and_pixels(p: Mapping[str, float], fisheye: bool, width: int, height: int) -> tuple[Array, Array]:
     """Rays that a photo shows, all over it, and where."""
     reach = np.hypot(width, height) / p["f"]
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-reach, reach, 121)] * 2))
@@ -342,8 +338,6 @@ def write_posed_photos(path: Path | str, posed: PosedPhotos, sensor_labels: Sequ
 
     Parameters
     ----------
-    path : Path or str
-        File to write.
     posed : PosedPhotos
         With the sensors of all its cameras.
     sensor_labels : sequence of str, optional
@@ -376,7 +370,7 @@ def write_posed_photos(path: Path | str, posed: PosedPhotos, sensor_labels: Sequ
     ElementTree.ElementTree(document).write(path, encoding="UTF-8", xml_declaration=True)
 
 
-def _text(numbers: NDArray[np.float64]) -> str:
+def _text(numbers: Array) -> str:
     return " ".join(map(repr, numbers.ravel().tolist()))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FormatError
+from ..model.array_types import Array
 from .tables import read_table
 
 __all__ = ["read_known_motions"]
@@ -17,7 +17,7 @@ _UNKNOWN = 1e6
 # rad per frame. No camera is rotated by more: a quarter of a turn in the 10 to 60 ms of a readout.
 _MOST = np.pi / 2
 
-Known = dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+Known = dict[str, tuple[Array, Array]]
 
 
 def read_known_motions(path: Path | str, readout_s: float | None = None) -> Known:

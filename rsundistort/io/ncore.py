@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Camera
+from ..model.array_types import Array
 from .export_scene import ExportScene
 from .photos.kinds import kind_of_name
 from .shutter_poses import end_poses
@@ -75,7 +76,7 @@ def write_ncore(folder: Path, scene: ExportScene) -> str:
     return ""
 
 
-def _world_from_camera(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> NDArray[np.float64]:
+def _world_from_camera(R_cw: Array, center_w: Array) -> Array:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = R_cw.T, center_w
     return matrix

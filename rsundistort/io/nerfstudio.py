@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError
 from ..model import Camera, Solution
+from ..model.array_types import Array
 from .json_text import read_json
 from .rules import Numbers, check
+from .usd import FLIP
 
 __all__ = ["read_transforms", "write_transforms"]
 
@@ -46,17 +47,17 @@ def intrinsics(camera: Camera) -> dict[str, Any]:
     return value | {name: lens[name] for name in ("k1", "k2", "p1", "p2")} | ({"k3": lens["k3"]} if lens["k3"] else {})
 
 
-def camera_to_world(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> list[list[float]]:
+def camera_to_world(R_cw: Array, center_w: Array) -> list[list[float]]:
     """The (4, 4) `transform_matrix` of a pose."""
     matrix = np.eye(4)
     # OpenCV looks along +z with y down, OpenGL along -z with y up
-    matrix[:3, :3] = R_cw.T @ np.diag([1.0, -1.0, -1.0])
+    matrix[:3, :3] = R_cw.T @ FLIP
     matrix[:3, 3] = center_w
     found: list[list[float]] = matrix.tolist()
     return found
 
 
-def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_transforms(path: Path) -> tuple[Array, Array]:
     """Poses R_cw (m, 3, 3) and center_w (m, 3) of a `transforms.json`."""
     value = read_json(path)
     try:
@@ -65,7 +66,7 @@ def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
         raise FormatError(f"{path} is no transforms.json: {error}") from error
     matrices = np.array([frame["transform_matrix"] for frame in value["frames"]], np.float64).reshape(-1, 4, 4)
     # back from OpenGL's axes; a matrix may hold a scale
-    axes = matrices[:, :3, :3] @ np.diag([1.0, -1.0, -1.0])
+    axes = matrices[:, :3, :3] @ FLIP
     with np.errstate(over="ignore"):
         length = np.linalg.norm(axes, axis=1, keepdims=True)
     if not ((length > 0) & np.isfinite(length)).all():
@@ -80,8 +81,6 @@ def write_transforms(
 
     Parameters
     ----------
-    path : Path
-        File to write.
     solution : Solution
         Poses and rectified cameras.
     files : mapping of photo name to (image path, mask path)

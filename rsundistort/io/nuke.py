@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Camera
+from ..model.array_types import Array, Index
 from .export_scene import ExportScene, euler_deg
 from .usd import FILM_WIDTH, FLIP
 
@@ -59,14 +59,8 @@ def _lens(camera: Camera) -> list[float]:
     return [float(fx * mm), FILM_WIDTH, float(camera.height * mm * fx / fy), float(u), float(v), float(ratio)]
 
 
-def _script(
-    frames: NDArray[np.int64],
-    centers: NDArray[np.float64],
-    angles: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    cameras: Sequence[Camera],
-) -> str:
-    def curve(values: NDArray[np.float64]) -> str:
+def _script(frames: Index, centers: Array, angles: Array, lens: Array, cameras: Sequence[Camera]) -> str:
+    def curve(values: Array) -> str:
         if np.ptp(values) == 0:
             return repr(float(values[0]))
         return "{curve " + " ".join(f"x{f} {v!r}" for f, v in zip(frames.tolist(), values.tolist(), strict=True)) + "}"

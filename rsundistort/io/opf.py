@@ -27,12 +27,13 @@ from ..colmap.measured_model import ColmapModel
 from ..colmap.rectified_model import rectified_keypoints
 from ..errors import FormatError, InputError
 from ..model import Camera, Observations, Reconstruction, Solution, SolvedImage
+from ..model.array_types import Array, Index
 from .export_scene import ExportScene, euler_deg, lens_left_px, rotation_left_px
 from .photos.exif_facts import ExifFacts, read_exif
+from .usd import FLIP
 
 __all__ = ["opf_model", "write_opf", "write_rectified_opf"]
 
-_FLIP = np.diag([1.0, -1.0, -1.0])
 # glTF has y up, OPF z: what its own converter undoes.
 _GLTF = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 # Errors of a lens that are not worth a word.
@@ -135,7 +136,7 @@ def _write(
         captures.append(_capture(Uid64(int=1 + k), sensor_id[image.camera_id], facts))
         assert image.R_cw is not None
         R_cw, center_w, way = _middle(solution, image) if rolling else (image.R_cw, image.center_w, None)
-        angles = euler_deg(R_cw.T @ _FLIP, "XYZ")
+        angles = euler_deg(R_cw.T @ FLIP, "XYZ")
         calibrated.append(opf.CalibratedCamera(ids[image.name], sensor_id[image.camera_id], angles, center_w, way))
     types = CoreProjectItemType
 
@@ -214,9 +215,7 @@ def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
     return opf.Capture(uid, [camera], height_m, uid, opf.RigModelSource.NOT_APPLICABLE, taken, place)
 
 
-def _middle(
-    solution: Solution, image: SolvedImage
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _middle(solution: Solution, image: SolvedImage) -> tuple[Array, Array, Array]:
     """The pose at the middle of the readout, and the way from the uppermost row to the lowest."""
     from .shutter_poses import end_poses
 
@@ -227,7 +226,7 @@ def _middle(
     return R_cw, (first + last) / 2, last - first
 
 
-def _points(rec: Reconstruction, xy: NDArray[np.float64], ids: dict[str, Any], rgb: NDArray[np.uint8]) -> Any:
+def _points(rec: Reconstruction, xy: Array, ids: dict[str, Any], rgb: NDArray[np.uint8]) -> Any:
     from pyopf.pointcloud.pcl import GlTFPointCloud, ImagePoints, Matches, Node, PointIndexRanges
 
     obs = rec.observations
@@ -297,7 +296,7 @@ def _model(project: Any, where: str) -> ColmapModel:
     cameras = [_camera(s.internals, sizes[s.id.int], f"{where}: sensor {s.id.int}") for s in found.sensors]
     place = {camera.id.int: k for k, camera in enumerate(found.cameras)}
     names = [checked_name(files[camera.id.int], where) for camera in found.cameras]
-    R_wc = Rotation.from_euler("XYZ", [c.orientation_deg for c in found.cameras], degrees=True).as_matrix() @ _FLIP
+    R_wc = Rotation.from_euler("XYZ", [c.orientation_deg for c in found.cameras], degrees=True).as_matrix() @ FLIP
     node = calibration.tracks.nodes[0]
     matches = node.matches
     if matches is None or matches.image_points is None:
@@ -330,7 +329,7 @@ def _model(project: Any, where: str) -> ColmapModel:
     )  # fmt: skip
 
 
-def _travels(found: Sequence[Any], cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _travels(found: Sequence[Any], cameras: Sequence[Camera]) -> tuple[Array, Array]:
     """Centres at the principal row (m, 3), and velocities (m, 3) a unit of the clock, of rows read downwards."""
     position = np.array([c.position for c in found], np.float64).reshape(-1, 3)
     way = np.array([np.zeros(3) if c.rolling_shutter is None else c.rolling_shutter for c in found]).reshape(-1, 3)
@@ -349,7 +348,7 @@ def _files(uris: dict[int, str]) -> dict[int, str]:
     return {uid: PurePosixPath(*path.parts[depth:]).as_posix() for uid, path in paths.items()}
 
 
-def _camera(internals: Any, size: NDArray[np.int64], where: str) -> Camera:
+def _camera(internals: Any, size: Index, where: str) -> Camera:
     if internals.type != "perspective":
         raise FormatError(f"{where} is {internals.type}, expected perspective")
     f, (cx, cy) = internals.focal_length_px, np.asarray(internals.principal_point_px, np.float64) - 0.5

@@ -143,10 +143,6 @@ class RemoteFile:
 
     Attributes
     ----------
-    folder : RemoteFolder
-        Where it lies.
-    path : str
-        In the folder.
     version : str
         Another one when the file has changed; empty where that is not known.
     """

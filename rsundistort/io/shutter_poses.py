@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Camera, RowMotion, Solution, SolvedImage
+from ..model.array_types import Array
 from ..model.projection import clock_of
 from .nerfstudio import camera_to_world, write_frames
 
@@ -27,7 +27,7 @@ _NGP_SHUTTER = {
 #: Lines whose poses are written of motions that are not steady, evenly spaced over those of a photo.
 _LINES = 65
 
-Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
+Pose = tuple[Array, Array]
 
 
 def write_shutter_poses(folder: Path, solution: Solution, photos: Mapping[str, str], points: str) -> str:
@@ -38,8 +38,6 @@ def write_shutter_poses(folder: Path, solution: Solution, photos: Mapping[str, s
 
     Parameters
     ----------
-    folder : Path
-        Where to write.
     solution : Solution
         In the stored frame: poses, motions, raw cameras, and in `quality["readout_times"]` what is known of these.
     photos : mapping of name to path
@@ -137,7 +135,7 @@ def _bent(solution: Solution, image: SolvedImage, place: float) -> Pose:
     return _motion(solution, image).pose_at(clock, image.R_cw, image.center_w)
 
 
-def _viewmat(pose: Pose) -> NDArray[np.float64]:
+def _viewmat(pose: Pose) -> Array:
     R_cw, center_w = pose
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = R_cw, -R_cw @ center_w
@@ -160,7 +158,7 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
     Ks = np.array([camera.K for camera in cameras]).reshape(-1, 3, 3)
     Ks[:, :2, 2] += 0.5  # its pixel centres are at 0.5
 
-    def lens(*names: str) -> NDArray[np.float64]:
+    def lens(*names: str) -> Array:
         rows = [[camera.coefficients.get(name, 0.0) for name in names] for camera in cameras]
         return np.array(rows).reshape(-1, len(names))
 

@@ -37,9 +37,7 @@ _IMAGE = {
     "center_w?": Maybe(Numbers(3)),
     "phi?": Maybe(Numbers(3)),
     "velocity?": Maybe(Numbers(3)),
-    "bend?": Maybe(
-        {"clock": Numbers(None), "rotation": Numbers(None, 3), "position?": Maybe(Numbers(None, 3))},
-    ),
+    "bend?": Maybe({"clock": Numbers(None), "rotation": Numbers(None, 3), "position?": Maybe(Numbers(None, 3))}),
     "sigma_phi?": Maybe((_NUMBER, _NUMBER, _NUMBER)),
     "num_observations?": Maybe(Between(0, 2**53)),
     "rms_px?": _AMOUNT,

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.array_types import Array
 from ..model.path import CameraPath
 
 __all__ = ["write_path", "write_point_cloud", "write_trajectory"]
@@ -16,15 +17,11 @@ __all__ = ["write_path", "write_point_cloud", "write_trajectory"]
 _PATH_COLUMNS = ["frame", "time_s", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz"]
 
 
-def write_trajectory(
-    path: Path, times: NDArray[np.float64], R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
-) -> None:
+def write_trajectory(path: Path, times: Array, R_cw: Array, center_w: Array) -> None:
     """Write poses as TUM text, which `evo` reads: `timestamp tx ty tz qx qy qz qw` a line, by time.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     times : (m,) array
         Timestamps.
     R_cw, center_w : (m, 3, 3), (m, 3) array
@@ -36,7 +33,7 @@ def write_trajectory(
         np.savetxt(file, table[order], fmt=["%.9f"] + 7 * ["%.12g"], header="timestamp tx ty tz qx qy qz qw")
 
 
-def _quaternions(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
+def _quaternions(R_cw: Array) -> Array:
     """(m, 4) rotations x, y, z, w of cameras in the world."""
     from scipy.spatial.transform import Rotation
 
@@ -49,8 +46,6 @@ def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> Non
 
     Parameters
     ----------
-    path : Path
-        File to write.
     names : sequence of str, length m
         The frame of each moment.
     camera_path : CameraPath
@@ -68,7 +63,7 @@ def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> Non
             table.writerow([name, f"{time_s:.9f}", *(f"{each:.12g}" for each in values)])
 
 
-def write_point_cloud(path: Path, points_w: NDArray[np.float64], rgb: NDArray[np.uint8] | None = None) -> None:
+def write_point_cloud(path: Path, points_w: Array, rgb: NDArray[np.uint8] | None = None) -> None:
     """Write points (n, 3) and their colours (n, 3), black when left out, as binary PLY."""
     rgb = np.zeros((len(points_w), 3), np.uint8) if rgb is None else rgb
     columns = dict(zip(("x", "y", "z", "red", "green", "blue"), (*points_w.T, *rgb.T), strict=True))

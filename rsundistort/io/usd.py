@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array
 from ..model.track import CameraTrack
 
 __all__ = ["FILM_WIDTH", "FLIP", "write_usd_camera"]
@@ -17,7 +17,7 @@ FILM_WIDTH = 36.0
 FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def write_usd_camera(path: Path, track: CameraTrack, points_w: NDArray[np.float64]) -> None:
+def write_usd_camera(path: Path, track: CameraTrack, points_w: Array) -> None:
     """Write a stage with an animated camera, which matches rectified frames, and the points of the scene.
 
     Parameters

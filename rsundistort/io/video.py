@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortWarning
+from ..model.array_types import Array
 from .ffmpeg_reasons import ffmpeg_errors, open_video
 from .outputs import output_folder
 from .photos.exif import ORIENTATION, pack_ifd
@@ -76,7 +77,7 @@ class VideoFrames:
     """
 
     names: tuple[str, ...]
-    time_s: NDArray[np.float64]
+    time_s: Array
     num_frames: int
     num_damaged: int
     orientation: int

@@ -139,14 +139,10 @@ class VideoWriter:
 
     Parameters
     ----------
-    path : Path
-        File to write.
     reader : VideoReader
         Of the other video, open.
     width, height : int
         Of the new frames.
-    threads : int
-        Of the encoder.
     """
 
     def __init__(self, path: Path, reader: VideoReader, width: int, height: int, threads: int = 0) -> None:

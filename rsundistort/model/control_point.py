@@ -21,8 +21,6 @@ class ControlPoint:
 
     Parameters
     ----------
-    name : str
-        Its name.
     place_m : (float, float, float)
         East, north and up, metres.
     sigma_m : (float, float, float)

@@ -173,8 +173,6 @@ def orient_solution(solution: Solution, orientations: Mapping[str, int]) -> Solu
 
     Parameters
     ----------
-    solution : Solution
-        Of the photos as they were.
     orientations : mapping of photo name to int
         How each was rotated; those left out were not.
 
@@ -219,8 +217,6 @@ def orient_reconstruction(reconstruction: Reconstruction, orientations: Mapping[
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        From the photos as they were.
     orientations : mapping of photo name to int
         As in `orient_solution`, whose cameras come in the same order. None may mirror.
     """

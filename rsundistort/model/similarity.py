@@ -63,8 +63,6 @@ class FittedSimilarity:
 
     Attributes
     ----------
-    similarity : Similarity
-        The estimate.
     middle : (3,) array
         That of the points, weighed, where they were moved to.
     sigma_m : (3,) array

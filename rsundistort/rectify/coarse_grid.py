@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .._kernels import maps as kernels
 from ..model import Camera, RowMotion, check_shutter_model
+from ..model.array_types import Array, Mask
 from ..model.field import add_field
 from .maps import EDGE_PX, seen_by
 
@@ -46,10 +47,10 @@ class CoarseGrid:
     camera: Camera
     motion: RowMotion
     shutter_model: str
-    rays: NDArray[np.float64]
-    nodes_x: NDArray[np.float64]
-    nodes_y: NDArray[np.float64]
-    smooth: NDArray[np.bool_]
+    rays: Array
+    nodes_x: Array
+    nodes_y: Array
+    smooth: Mask
     spacing: int
     error_px: float
 
@@ -76,7 +77,7 @@ class CoarseGrid:
 
 
 def coarse_grid(
-    camera: Camera, motion: RowMotion, shutter_model: str, rays: NDArray[np.float64], size: tuple[int, int]
+    camera: Camera, motion: RowMotion, shutter_model: str, rays: Array, size: tuple[int, int]
 ) -> CoarseGrid:
     """The coarsest grid of a map that is off by at most `TOLERANCE_PX`.
 
@@ -92,7 +93,7 @@ def coarse_grid(
     intr, lens, axis, sign = camera.kernel_args
     model = check_shutter_model(shutter_model)
 
-    def at_nodes(rows: int, cols: int, spacing: int, offset: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def at_nodes(rows: int, cols: int, spacing: int, offset: float) -> tuple[Array, Array]:
         step = np.array([[spacing, 0, offset], [0, spacing, offset], [0, 0, 1.0]])
         x, y = np.empty((rows, cols)), np.empty((rows, cols))
         kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays @ step, 0, x, y)
@@ -123,7 +124,7 @@ def _corners(values: NDArray[Any]) -> NDArray[Any]:
     return values[rows][:, :, cols]
 
 
-def _interpolated(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolated(nodes: Array) -> Array:
     """(3 m, 3 n) values in the middles between nodes."""
     m, n = (length // 3 for length in nodes.shape)
     return (_BETWEEN @ (_corners(nodes) @ _BETWEEN.T).reshape(m, 4, -1)).reshape(3 * m, 3 * n)

@@ -222,7 +222,9 @@ class RemapGrid:
         try:
             with OpenEXR.File(str(path), header_only=True) as file:
                 low, high = file.header()["dataWindow"]
-            _check_claim(path, math.prod((np.asarray(high, int) - low + 1).tolist()))
+            pixels, size = math.prod((np.asarray(high, int) - low + 1).tolist()), path.stat().st_size
+            if pixels > max(_LEAST_LIMIT, _MOST_PIXELS_A_BYTE * size):
+                raise FormatError(f"its header claims {pixels} pixels, more than its {size} bytes hold")
             with OpenEXR.File(str(path), separate_channels=True) as file:
                 words = str(file.header().get(_ATTRIBUTE, "")).split()
                 x, y = (np.asarray(file.channels()[name].pixels, np.float64) for name in "RG")
@@ -237,12 +239,6 @@ class RemapGrid:
         nowhere = ~(np.isfinite(x) & np.isfinite(y))
         x[nowhere] = y[nowhere] = _NOWHERE
         return cls(x.astype(np.float32), y.astype(np.float32), width, height)
-
-
-def _check_claim(path: Path, pixels: int) -> None:
-    """Refuse a file whose header claims far more pixels than it has bytes for."""
-    if pixels > max(_LEAST_LIMIT, _MOST_PIXELS_A_BYTE * path.stat().st_size):
-        raise FormatError(f"its header claims {pixels} pixels, more than its {path.stat().st_size} bytes hold")
 
 
 def _openexr() -> Any:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from .._kernels import maps as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
+from ..model.array_types import Array
 from ..model.checks import check_finite, check_rotation, check_size
 from ..model.depth import check_depth
 from ..model.field import add_field
@@ -21,7 +22,7 @@ __all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
 EDGE_PX = 1e-3
 
 
-def rectified_rays(new_K: ArrayLike | None, R: ArrayLike | None, camera: Camera) -> NDArray[np.float64]:
+def rectified_rays(new_K: ArrayLike | None, R: ArrayLike | None, camera: Camera) -> Array:
     """(3, 3) matrix from rectified pixels (u, v, 1) to directions in the camera frame."""
     K = camera.K if new_K is None else check_finite(new_K, (3, 3), "new_K")
     rotation = np.eye(3) if R is None else check_rotation(R, "R")
@@ -35,7 +36,7 @@ def fill_rows(
     camera: Camera,
     motion: RowMotion,
     shutter_model: str,
-    rays: NDArray[np.float64],
+    rays: Array,
     row0: int,
     map_x: NDArray[np.float32],
     map_y: NDArray[np.float32],

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Camera, RowMotion
+from ..model.array_types import Array
 from ..model.checks import check_fields, check_number, check_size
 from ..model.projection import motion_of, unproject_points
 
@@ -77,8 +77,6 @@ def rectified_view(
         Of all of them: one camera has to do for all.
     shutter_model : str
         As in `init_rectify_map`.
-    view : ViewOptions
-        What is asked for.
     as_it_was : Camera
         The rectified camera where `view.alpha` is None.
     """
@@ -133,7 +131,7 @@ def steadiest_pinhole(camera: Camera, before: Camera) -> Camera:
     return replace(plain, K=K)
 
 
-def _empty(outline: _Outline, K: NDArray[np.float64], camera: Camera) -> float:
+def _empty(outline: _Outline, K: Array, camera: Camera) -> float:
     """How wide the widest empty border of a rectified photo is, in pixels."""
     f, c, last = np.diag(K)[:2], K[:2, 2], np.array([camera.width - 1, camera.height - 1])
     return float(max((f * outline.inner_lo + c).max(), (last - f * outline.inner_hi - c).max()))
@@ -143,10 +141,10 @@ def _empty(outline: _Outline, K: NDArray[np.float64], camera: Camera) -> float:
 class _Outline:
     """The border of a photo in ideal normalised coordinates: the rectangle within it, and that around it."""
 
-    inner_lo: NDArray[np.float64]
-    inner_hi: NDArray[np.float64]
-    outer_lo: NDArray[np.float64]
-    outer_hi: NDArray[np.float64]
+    inner_lo: Array
+    inner_hi: Array
+    outer_lo: Array
+    outer_hi: Array
 
     def roi(self, new_camera: Camera) -> tuple[int, int, int, int] | None:
         """The pixels (x, y, width, height) of a rectified photo within the inner rectangle."""
@@ -175,7 +173,7 @@ def _outline(camera: Camera, motion: RowMotion | None, shutter_model: str) -> _O
     )
 
 
-def _border(camera: Camera) -> list[NDArray[np.float64]]:
+def _border(camera: Camera) -> list[Array]:
     """Pixels of the left, right, top and bottom border of the raw photo."""
     w, h = camera.width - 1.0, camera.height - 1.0
     u, v = np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .._kernels import maps as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion, check_shutter_model
+from ..model.array_types import Array
 from ..model.checks import check_kind, check_one_of, check_whole
 from ..model.depth import check_depth
 from ..model.projection import motion_of
@@ -148,12 +149,7 @@ FillRows = Callable[[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.u
 
 
 def _fill_rows(
-    camera: Camera,
-    motion: RowMotion,
-    shutter_model: str,
-    rays: NDArray[np.float64],
-    size: tuple[int, int],
-    depth: Depth,
+    camera: Camera, motion: RowMotion, shutter_model: str, rays: Array, size: tuple[int, int], depth: Depth
 ) -> FillRows:
     """What fills the rows of the map of a photo of `size`: interpolated, but exact where depths make it rough."""
     depth_rows = DepthRows(depth, camera, motion, rays, size)

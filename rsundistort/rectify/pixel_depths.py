@@ -11,19 +11,20 @@ from numpy.typing import NDArray
 from .._kernels import depth as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
+from ..model.array_types import Array
 from ..model.projection import clock_of
 
 __all__ = ["DepthRows", "inverse_depth_at", "stretch"]
 
 
-def stretch(depth: DepthMap) -> NDArray[np.float64]:
+def stretch(depth: DepthMap) -> Array:
     """(2,) pixels of the map per pixel of the rectified photo, in x and y."""
     assert depth.size is not None
     rows, cols = depth.depth.shape
     return np.array([cols / depth.size[0], rows / depth.size[1]])
 
 
-def inverse_depth_at(depth: Depth, xy: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse_depth_at(depth: Depth, xy: Array, rays: Array) -> Array:
     """(n,) inverse depths of what pixels (n, 2) of the rectified photo show; `rays` as of `rectified_rays`."""
     if isinstance(depth, Plane):
         return depth.inverse_depth(np.column_stack([xy, np.ones(len(xy))]) @ rays.T)
@@ -42,8 +43,6 @@ class DepthRows:
 
     Parameters
     ----------
-    depth : Depth
-        Of the photo.
     camera, motion
         Of the raw photo; the velocity in the camera frame.
     rays : (3, 3) array
@@ -55,7 +54,7 @@ class DepthRows:
     depth: Depth
     camera: Camera
     motion: RowMotion
-    rays: NDArray[np.float64]
+    rays: Array
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
@@ -92,7 +91,7 @@ class DepthRows:
             )  # fmt: skip
 
     @cached_property
-    def _epipoles(self) -> NDArray[np.float64]:
+    def _epipoles(self) -> Array:
         """(lines, 3) where the camera was when it read each line, in homogeneous pixels of the rectified photo."""
         lines = np.arange(self.camera.num_lines, dtype=np.float64)
         way = self.motion.at(clock_of(self.camera, np.stack([lines, lines], axis=1)))[1]

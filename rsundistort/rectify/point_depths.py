@@ -5,11 +5,11 @@ from __future__ import annotations
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import depth as kernels
 from ..errors import InputError
 from ..model import DepthMap, Plane
+from ..model.array_types import Array, Mask
 from .pixel_depths import inverse_depth_at
 
 __all__ = ["depth_from_points", "fit_plane", "plane_in_camera", "prefers_plane"]
@@ -26,7 +26,7 @@ _CELL_PX = 6
 _NUM_TRIPLES = 500
 
 
-def _believed(xy: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _believed(xy: Array, inverse: Array) -> Mask:
     """(n,) points that agree with neighbours."""
     from scipy.spatial import cKDTree
 
@@ -40,7 +40,7 @@ def _believed(xy: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[
     return believed if believed.any() else np.ones(len(xy), bool)
 
 
-def _interpolate(xy: NDArray[np.float64], inverse: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+def _interpolate(xy: Array, inverse: Array, size: tuple[int, int]) -> Array:
     """Coarse map (rows, cols): linear in the triangles between the points, that of the nearest point beyond them."""
     from scipy.spatial import Delaunay, QhullError, cKDTree
 
@@ -58,7 +58,7 @@ def _interpolate(xy: NDArray[np.float64], inverse: NDArray[np.float64], size: tu
     return field
 
 
-def depth_from_points(xy: NDArray[np.float64], depth: NDArray[np.float64], size: tuple[int, int]) -> DepthMap:
+def depth_from_points(xy: Array, depth: Array, size: tuple[int, int]) -> DepthMap:
     """A coarse depth map of a photo from the depths of some points.
 
     Inverse depth is interpolated linearly in the Delaunay triangles between the points, and is that of the nearest
@@ -86,7 +86,7 @@ def depth_from_points(xy: NDArray[np.float64], depth: NDArray[np.float64], size:
     return DepthMap((1.0 / smooth).astype(np.float32), size)
 
 
-def fit_plane(points_w: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def fit_plane(points_w: Array) -> tuple[Array, float]:
     """The plane nearest to most of the points (n, 3): unit normal and offset, normal @ X = offset.
 
     Least median of squares over planes through three of the points, then least squares over those that lie near
@@ -113,9 +113,7 @@ def fit_plane(points_w: NDArray[np.float64]) -> tuple[NDArray[np.float64], float
     return normal, offset
 
 
-def plane_in_camera(
-    normal_w: NDArray[np.float64], offset: float, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
-) -> Plane | None:
+def plane_in_camera(normal_w: Array, offset: float, R_cw: Array, center_w: Array) -> Plane | None:
     """A plane of the world as a camera sees it; None if the camera stands on it."""
     distance = offset - float(normal_w @ center_w)
     if distance == 0:
@@ -123,13 +121,7 @@ def plane_in_camera(
     return Plane(R_cw @ normal_w * np.sign(distance), abs(distance))
 
 
-def prefers_plane(
-    plane: Plane,
-    xy: NDArray[np.float64],
-    rays_c: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    size: tuple[int, int],
-) -> bool:
+def prefers_plane(plane: Plane, xy: Array, rays_c: Array, depth: Array, size: tuple[int, int]) -> bool:
     """Whether a plane predicts the depths of half of the points at least as well as a map of the other half does.
 
     Parameters

@@ -7,11 +7,12 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .._kernels.depth import EDGE
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
+from ..model.array_types import Array
 from ..model.checks import check_array, check_finite, check_kind, check_numbers
 from ..model.depth import check_depth
 from ..model.projection import clock_of, motion_of, project_points, unproject_points
@@ -25,23 +26,13 @@ _STEPS_PER_PX = 2
 _BISECTIONS = 50
 
 
-def _as_list(points: ArrayLike, name: str) -> tuple[NDArray[np.float64], tuple[int, ...]]:
-    """Points (n, 2) of any of cv2's shapes: (n, 2), (n, 1, 2), (1, n, 2)."""
-    array = check_numbers(points, name)
-    if array.ndim not in (2, 3) or array.shape[-1] != 2 or (array.ndim == 3 and 1 not in array.shape[:2]):
-        raise InputError(f"{name}.shape={array.shape}, expected (N, 2), (N, 1, 2) or (1, N, 2)")
-    return array.reshape(-1, 2), array.shape
-
-
-def _homogeneous(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _homogeneous(xy: Array) -> Array:
     """(n, 3) points of z = 1; those that are no numbers become NaN, since infinity times zero is none."""
     xy = np.where(np.isfinite(xy).all(1, keepdims=True), xy, np.nan)
     return np.column_stack([xy, np.ones(len(xy))])
 
 
-def _inverse_depths(
-    depth: Depth | ArrayLike, xy: NDArray[np.float64], rays: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _inverse_depths(depth: Depth | ArrayLike, xy: Array, rays: Array) -> Array:
     """(n,) inverse depths of rectified pixels (n, 2)."""
     if isinstance(depth, AtInfinity | Plane | DepthMap):
         return inverse_depth_at(depth, xy, rays)
@@ -58,23 +49,21 @@ def _checked(
     R: ArrayLike | None,
     P: ArrayLike | None,
     depth: Depth | ArrayLike | None,
-) -> tuple[NDArray[np.float64], tuple[int, ...], RowMotion, NDArray[np.float64], Depth | ArrayLike]:
+) -> tuple[Array, tuple[int, ...], RowMotion, Array, Depth | ArrayLike]:
     """Arguments of both directions: points (n, 2), their shape, the motion, rays of `rectified_rays`, and the depth."""
-    xy, shape = _as_list(points, "points")
+    xy = check_numbers(points, "points")
+    if xy.ndim not in (2, 3) or xy.shape[-1] != 2 or (xy.ndim == 3 and 1 not in xy.shape[:2]):
+        raise InputError(f"points.shape={xy.shape}, expected (N, 2), (N, 1, 2) or (1, N, 2)")
     depth = AtInfinity() if depth is None else depth
     if isinstance(depth, DepthMap) and P is None:
         raise InputError("a depth map has the pixels of the rectified photo: P is needed")
-    return xy, shape, motion_of(camera, motion), rectified_rays(np.eye(3) if P is None else P, R, camera), depth
+    motion, P = motion_of(camera, motion), np.eye(3) if P is None else P
+    return xy.reshape(-1, 2), xy.shape, motion, rectified_rays(P, R, camera), depth
 
 
 def _rectified(
-    xy: NDArray[np.float64],
-    camera: Camera,
-    motion: RowMotion,
-    shutter_model: str,
-    rays: NDArray[np.float64],
-    depth: Depth | ArrayLike,
-) -> NDArray[np.float64]:
+    xy: Array, camera: Camera, motion: RowMotion, shutter_model: str, rays: Array, depth: Depth | ArrayLike
+) -> Array:
     """Rectified pixels (n, 2) of raw pixels; rays (3, 3) as of `rectified_rays`."""
     ideal, _ = unproject_points(xy, camera, motion, shutter_model)
     q = _homogeneous(ideal) @ np.linalg.inv(rays).T
@@ -87,7 +76,7 @@ def _rectified(
     # from there, which starts at infinity where the rotation alone takes the pixel.
     moved = np.linalg.solve(rays, motion.at(clock_of(camera, xy))[1].T).T
 
-    def on_line(inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+    def on_line(inverse: Array) -> Array:
         w = inverse[:, None]
         return xy_rect * (1 - w * moved[:, 2:]) + w * moved[:, :2]
 
@@ -102,15 +91,13 @@ def _rectified(
     return on_line(_inverse_depths(depth, xy, rays))
 
 
-def _first_hit(
-    depth: DepthMap, on_line: Callable[[NDArray[np.float64]], NDArray[np.float64]], num: int, steps: int
-) -> NDArray[np.float64]:
+def _first_hit(depth: DepthMap, on_line: Callable[[Array], Array], num: int, steps: int) -> Array:
     """Inverse depths (n,) where lines that come from the camera first meet a depth map: a march, then bisection.
 
     A line may pass behind the edge of a thing; it meets it there only if it does not come out again.
     """
 
-    def field(w: NDArray[np.float64]) -> NDArray[np.float64]:
+    def field(w: Array) -> Array:
         return inverse_depth_at(depth, on_line(w), np.eye(3))
 
     marks = np.linspace(float(depth.inverse.max()), 0.0, steps + 1)
@@ -141,7 +128,7 @@ def undistort_points(
     R: ArrayLike | None = None,
     P: ArrayLike | None = None,
     depth: Depth | ArrayLike | None = None,
-) -> NDArray[np.float64]:
+) -> Array:
     """Where raw pixels lie without lens and shutter, in the manner of `cv2.undistortPoints`.
 
     Parameters
@@ -176,7 +163,7 @@ def distort_points(
     R: ArrayLike | None = None,
     P: ArrayLike | None = None,
     depth: Depth | ArrayLike | None = None,
-) -> NDArray[np.float64]:
+) -> Array:
     """Raw pixels that show points of the rectified photo: the inverse of `undistort_points`.
 
     Parameters
@@ -276,14 +263,14 @@ def translation_shift_px(camera: Camera, motion: RowMotion, depth: Depth, new_ca
     return _largest(camera, at_depth, far)
 
 
-def _rectified_grid(camera: Camera, new_camera: Camera | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rectified_grid(camera: Camera, new_camera: Camera | None) -> tuple[Array, Array]:
     """Pixels (n, 2) over a rectified photo, its border among them, and its K."""
     new = new_camera or camera.pinhole()
     u, v = np.meshgrid(np.linspace(0, new.width - 1, 97), np.linspace(0, new.height - 1, 65))
     return np.column_stack([u.ravel(), v.ravel()]), new.K
 
 
-def _largest(camera: Camera, raw: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def _largest(camera: Camera, raw: Array, other: Array) -> float:
     """Largest distance of raw pixels (n, 2) from others, of those that lie in the photo."""
     with np.errstate(invalid="ignore"):
         inside = ((raw >= 0) & (raw <= [camera.width - 1, camera.height - 1])).all(1)

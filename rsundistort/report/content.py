@@ -8,11 +8,11 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..critical.degeneracy import readout_axes
 from ..io import output_name
 from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
+from ..model.array_types import Array, Mask
 from ..model.field import field_over_frame
 from ..model.orientation import MATRICES, in_stored_frame, orient_points, split_mirror
 from .displacement import displacement_field
@@ -94,7 +94,7 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
         low, high = min(rotation.min(), steady.min()), max(rotation.max(), steady.max())
         room = max(float(high - low), 1e-9)
 
-        def paths(values: NDArray[np.float64], high: float = high, room: float = room) -> list[str]:
+        def paths(values: Array, high: float = high, room: float = room) -> list[str]:
             x, y = np.linspace(0, width, len(values)), 4 + (height - 8) * (high - values) / room
             return ["M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, each, strict=True)) for each in y.T]
 
@@ -147,7 +147,7 @@ def longer(largest: Sequence[float]) -> int:
 
 def arrows_of(
     solution: Solution, image: SolvedImage, depth: float | None, orientation: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, int]]:
+) -> tuple[Array, Array, tuple[int, int]]:
     """A photo's displacement field in the pixels of its upright picture, whose size comes with it."""
     # to the stored frame, then upright: `orientation` goes all the way
     stored = in_stored_frame(Solution(
@@ -325,7 +325,7 @@ def _address(data: bytes | None) -> str | None:
     return None if data is None else f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
-def _packed(values: NDArray[np.float64]) -> dict[str, str]:
+def _packed(values: Array) -> dict[str, str]:
     """Points (n, 3) as three arrays for plotly.js."""
     return {
         axis: base64.b64encode(np.ascontiguousarray(values[:, k], "<f4").tobytes()).decode()
@@ -333,14 +333,14 @@ def _packed(values: NDArray[np.float64]) -> dict[str, str]:
     }
 
 
-def _numbers(values: NDArray[np.float64]) -> Any:
+def _numbers(values: Array) -> Any:
     """Nested lists of rounded numbers, None where there is none."""
     rounded = np.round(values, 4).astype(object)
     rounded[~np.isfinite(values)] = None
     return rounded.tolist()
 
 
-def view_frame(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
+def view_frame(R_cw: Array) -> Array:
     """Rotation from the world to a frame with z up, x to the right of the first photos, by upright cameras."""
     up = -R_cw[:, 1].mean(0)
     if np.linalg.norm(up) < 0.3:  # cameras look at all sides, or down in all directions
@@ -354,7 +354,7 @@ def view_frame(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([right, np.cross(up, right), up])
 
 
-def _size(centers: NDArray[np.float64], points: NDArray[np.float64]) -> float:
+def _size(centers: Array, points: Array) -> float:
     """Extent of the scene from the middle of the cameras, without its farthest points."""
     middle = np.median(centers, axis=0)
     every = centers if not len(points) else points
@@ -362,7 +362,7 @@ def _size(centers: NDArray[np.float64], points: NDArray[np.float64]) -> float:
     return max(float(np.quantile(distance, 0.9)), float(np.linalg.norm(centers - middle, axis=1).max()), 1e-9)
 
 
-def _spacing(centers: NDArray[np.float64]) -> float:
+def _spacing(centers: Array) -> float:
     """Median distance of a camera from the nearest other; of some, where they are many."""
     some = centers[np.unique(np.linspace(0, len(centers) - 1, 200).astype(int))]
     distance = np.linalg.norm(some[:, None] - centers[None], axis=2)
@@ -371,12 +371,12 @@ def _spacing(centers: NDArray[np.float64]) -> float:
     return float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else 0.0
 
 
-def _is_near(points: NDArray[np.float64], centers: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = np.linalg.norm(points - np.median(centers, axis=0), axis=1) < 2 * reach
+def _is_near(points: Array, centers: Array, reach: float) -> Mask:
+    near: Mask = np.linalg.norm(points - np.median(centers, axis=0), axis=1) < 2 * reach
     return near
 
 
-def _box(points: NDArray[np.float64], centers: NDArray[np.float64]) -> list[list[float]]:
+def _box(points: Array, centers: Array) -> list[list[float]]:
     """Ranges of the three axes that contain the cameras, and all but the farthest points."""
     low, high = centers.min(0), centers.max(0)
     if len(points):
@@ -386,9 +386,7 @@ def _box(points: NDArray[np.float64], centers: NDArray[np.float64]) -> list[list
     return np.round(np.stack([low - pad, high + pad], axis=1), 5).tolist()
 
 
-def _frusta(
-    R_cw: NDArray[np.float64], centers: NDArray[np.float64], lenses: Sequence[Camera], side: float
-) -> NDArray[np.float64]:
+def _frusta(R_cw: Array, centers: Array, lenses: Sequence[Camera], side: float) -> Array:
     """(k, 3) polylines with NaN between them: a pyramid for each camera."""
     half = np.array([[lens.width / lens.K[0, 0] / 2, lens.height / lens.K[1, 1] / 2] for lens in lenses])
     half = np.minimum(half, 1.5)

@@ -17,6 +17,7 @@ from ..errors import FormatError, format_errors
 from ..evaluation import align_points
 from ..io.aside import write_aside
 from ..model import Reconstruction
+from ..model.array_types import Array, Index
 from ..model.arrays import read_arrays
 from ..model.reprojection import reprojection_residuals
 
@@ -77,20 +78,20 @@ class Diagnostics:
     """
 
     names: tuple[str, ...]
-    rms_px: NDArray[np.float64]
-    depth: NDArray[np.float64]
-    row_rms_px: NDArray[np.float64]
-    row_mean_px: NDArray[np.float64]
-    cell_mean_px: NDArray[np.float64]
+    rms_px: Array
+    depth: Array
+    row_rms_px: Array
+    row_mean_px: Array
+    cell_mean_px: Array
     camera_ids: tuple[str, ...]
-    histogram_px: NDArray[np.float64]
-    histogram: NDArray[np.int64]
-    points_w: NDArray[np.float64]
-    global_points_w: NDArray[np.float64]
-    point_idx: NDArray[np.int64]
+    histogram_px: Array
+    histogram: Index
+    points_w: Array
+    global_points_w: Array
+    point_idx: Index
     rgb: NDArray[np.uint8]
-    global_R_cw: NDArray[np.float64]
-    global_center_w: NDArray[np.float64]
+    global_R_cw: Array
+    global_center_w: Array
     photos: str = ""
 
     def __post_init__(self) -> None:
@@ -189,7 +190,7 @@ def _is_float(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype.kind == "f"
 
 
-def _some(count: int) -> NDArray[np.int64]:
+def _some(count: int) -> Index:
     """Indices of some of `count` things, evenly spaced."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, _MAX_POINTS)).astype(np.int64))
 
@@ -198,7 +199,7 @@ def _aligned(rec: Reconstruction, like: Reconstruction) -> Reconstruction:
     """A reconstruction of the same photos in the frame of another: cameras, with the way they look, compare."""
     reach = like.size if like.num_points else like.baseline
 
-    def marks(each: Reconstruction, unit: float) -> NDArray[np.float64]:
+    def marks(each: Reconstruction, unit: float) -> Array:
         ahead = each.center_w[:, None] + unit * each.R_cw
         return np.concatenate([each.center_w[:, None], ahead], axis=1).reshape(-1, 3)
 
@@ -212,7 +213,7 @@ def _aligned(rec: Reconstruction, like: Reconstruction) -> Reconstruction:
     )
 
 
-def _median_depth(rec: Reconstruction) -> NDArray[np.float64]:
+def _median_depth(rec: Reconstruction) -> Array:
     obs = rec.observations
     ahead = rec.R_cw[obs.frame_idx, 2]
     z = ((rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx]) * ahead).sum(1)
@@ -237,37 +238,37 @@ class _Residuals:
         along = self.place[np.arange(len(self.place)), axis]
         self.clock = np.where(sign > 0, along, 1 - along)
 
-    def by_photo(self) -> NDArray[np.float64]:
+    def by_photo(self) -> Array:
         """(m,) root mean square."""
         return np.sqrt(_means(self.frame_idx, (self.xy**2).mean(1), self.rec.num_images))
 
-    def by_row(self) -> NDArray[np.float64]:
+    def by_row(self) -> Array:
         """(b,) root mean square."""
         return np.sqrt(_means(_bin(self.clock, _ROWS), (self.xy**2).mean(1), _ROWS))
 
-    def by_photo_and_row(self) -> NDArray[np.float64]:
+    def by_photo_and_row(self) -> Array:
         """(m, c, 2) mean."""
         where = self.frame_idx * _ROWS_OF_PHOTO + _bin(self.clock, _ROWS_OF_PHOTO)
         return self._mean_xy(where, self.rec.num_images, _ROWS_OF_PHOTO)
 
-    def by_cell(self) -> NDArray[np.float64]:
+    def by_cell(self) -> Array:
         """(cameras, down, across, 2) mean."""
         across, down = _CELLS
         cell = _bin(self.place[:, 1], down) * across + _bin(self.place[:, 0], across)
         where = self.rec.camera_idx[self.frame_idx] * down * across + cell
         return self._mean_xy(where, len(self.rec.cameras), down, across)
 
-    def _mean_xy(self, where: NDArray[np.int64], *shape: int) -> NDArray[np.float64]:
+    def _mean_xy(self, where: Index, *shape: int) -> Array:
         """(*shape, 2) mean, by the number of the cell where each residual is."""
         mean = [_means(where, part, math.prod(shape)) for part in self.xy.T]
         return np.stack(mean, axis=-1).reshape(*shape, 2)
 
 
-def _bin(place: NDArray[np.float64], num: int) -> NDArray[np.int64]:
+def _bin(place: Array, num: int) -> Index:
     return np.minimum((place * num).astype(np.int64), num - 1)
 
 
-def _means(where: NDArray[np.int64], values: NDArray[np.float64], num: int) -> NDArray[np.float64]:
+def _means(where: Index, values: Array, num: int) -> Array:
     """(num,) mean of the values of each index; NaN where there is none."""
     count = np.bincount(where, minlength=num)
     total = np.bincount(where, values, minlength=num)

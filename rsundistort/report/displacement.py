@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Camera, Solution, SolvedImage
+from ..model.array_types import Array
 from ..rectify import distort_points, undistort_points
 
 __all__ = ["displacement_field"]
@@ -13,13 +13,11 @@ __all__ = ["displacement_field"]
 
 def displacement_field(
     solution: Solution, image: SolvedImage, depth: float | None = None, across: int = 12
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Where a photo shows things, and where a global shutter would have shown them.
 
     Parameters
     ----------
-    solution : Solution
-        With the cameras.
     image : SolvedImage
         A registered photo.
     depth : float, optional
@@ -50,7 +48,7 @@ def displacement_field(
     return raw[seen], still[seen]
 
 
-def _grid(camera: Camera, across: int) -> NDArray[np.float64]:
+def _grid(camera: Camera, across: int) -> Array:
     """Middles of square cells over the photo."""
     step = max(camera.width, camera.height) / across
     u, v = (np.arange(step / 2, size, step) for size in (camera.width, camera.height))

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..critical.degeneracy import readout_axes
 from ..errors import FileError, InputError
 from ..io.aside import written_aside
 from ..io.outputs import only_writer
 from ..io.record import Record
+from ..model.array_types import Array
 from .content import arrows_of, longer, models, view_frame
 from .source import Source, read_source
 from .verdict import degeneracy_of
@@ -46,11 +46,6 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
         As `run` and `solve` leave it.
     figures : path
         Folder, made if missing; figures of the same names are replaced.
-
-    Returns
-    -------
-    list of Path
-        Written.
 
     Raises
     ------
@@ -178,7 +173,7 @@ def _paths(figure: Figure, source: Source) -> bool:
     return True
 
 
-def _mark(axes: Any, shown: NDArray[np.float64]) -> None:
+def _mark(axes: Any, shown: Array) -> None:
     """The scene's points, faint, behind the paths."""
     low, high = np.quantile(shown, [0.02, 0.98], axis=0)
     shown = shown[((shown >= low) & (shown <= high)).all(1)]

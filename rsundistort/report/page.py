@@ -54,11 +54,6 @@ def write_report(
     progress : callable, optional
         Called as (stage, done, total).
 
-    Returns
-    -------
-    Path
-        Of the report.
-
     Raises
     ------
     FileError, FormatError
@@ -77,9 +72,7 @@ def write_report(
     return source.out / _NAME
 
 
-def _pictures(
-    source: Source, threads: int, progress: Callable[[str, int, int], None] | None
-) -> dict[str, Picture]:  # fmt: skip
+def _pictures(source: Source, threads: int, progress: Callable[[str, int, int], None] | None) -> dict[str, Picture]:
     jobs = {}
     for image in source.solution.registered:
         before, after = source.before(image.name), source.after(image.name)

@@ -21,10 +21,6 @@ class Source:
 
     Attributes
     ----------
-    out : Path
-        Folder of the outputs.
-    solution : Solution
-        Of `solution.json`.
     diagnostics : Diagnostics or None
         Of `report.npz`, if it is there and of this solution.
     photos : Path or None

@@ -47,8 +47,6 @@ def contradicting_photos(
     matched, num_verified
         Photos, and how many matches of each pair one loose epipolar geometry fits (`read_num_verified`, before new
         tracks overwrite it).
-    reconstruction : Reconstruction
-        Poses and motions.
     suspects : bool
         Whether photos whose place is less certain to be wrong are among them.
 

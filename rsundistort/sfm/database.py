@@ -47,8 +47,6 @@ class MatchedPhotos:
     ----------
     database : Path
         pycolmap's database; image ids are 1 + index of the photo, and so are its images' names.
-    names, features : sequences of length m
-        Photos.
     cameras, camera_idx : cameras, and the camera of each photo
         Intrinsics; a guess where `calibrated` is False.
     calibrated : bool

@@ -41,12 +41,7 @@ _LEAST_SHARE = 0.5
 class FreedMatches:
     """Matches under a reconstruction: rays without lens and shutter, from where the camera was when it read them.
 
-    Parameters
-    ----------
-    matched : MatchedPhotos
-        Keypoints of at least the reconstruction's photos.
-    reconstruction : Reconstruction
-        Poses, motions and cameras.
+    The keypoints are those of the reconstruction's photos at least.
     """
 
     def __init__(self, matched: MatchedPhotos, reconstruction: Reconstruction) -> None:
@@ -174,8 +169,6 @@ def agreeing_photos(
     ----------
     matched, matches, num_verified
         Photos, their matches, and how many of these such a geometry fits.
-    reconstruction : Reconstruction
-        Poses and motions.
 
     Returns
     -------

@@ -15,6 +15,7 @@ from ..model.array_types import Array, Index, Mask
 __all__ = ["FlowFrame", "FlowTracks", "KeyFlow", "KeyFrameChooser", "flow_between", "flow_size", "from_reduced"]
 
 Grey = NDArray[np.uint8]
+Places = NDArray[np.float32]
 
 # Larger frames are reduced to this: a twentieth of a pixel there is a tenth in a 4K frame.
 _FLOW_MEGAPIXELS = 2.1
@@ -103,9 +104,9 @@ def _even(grey: Grey, area: int) -> Grey:
 
 
 def _followed(
-    before: FlowFrame, after: FlowFrame, xy: NDArray[np.float32], guess: NDArray[np.float32] | None = None,
+    before: FlowFrame, after: FlowFrame, xy: Places, guess: Places | None = None,
     levels: int = _LEVELS,
-) -> tuple[NDArray[np.float32], Mask]:  # fmt: skip
+) -> tuple[Places, Mask]:  # fmt: skip
     """Where points (n, 2) of a frame lie in another, and which of them (n,) were found there and back again.
 
     If most were not, the content moved far, and they are looked for again from where the reduced frames show them. (Of
@@ -125,9 +126,7 @@ def _followed(
     return there, seen
 
 
-def _there_and_back(
-    before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32], levels: int
-) -> tuple[NDArray[np.float32], Mask]:
+def _there_and_back(before: Grey, after: Grey, xy: Places, start: Places, levels: int) -> tuple[Places, Mask]:
     """Where points lie in another frame, and which of them returned.
 
     What shows the same returns at the finest level from where it was, or not at all; of other things this finds what
@@ -152,9 +151,7 @@ def _there_and_back(
     return there, np.isin(np.arange(len(xy)), np.concatenate([sure, seen[returned(seen, levels)]]))
 
 
-def _sought(
-    before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32], levels: int
-) -> tuple[NDArray[np.float32], Mask, NDArray[np.float32]]:
+def _sought(before: Grey, after: Grey, xy: Places, start: Places, levels: int) -> tuple[Places, Mask, Places]:
     """Where points are found in another picture, looked for from a start (Lucas and Kanade 1981, Bouguet 2000).
 
     And by how much their windows differ, in grey levels.
@@ -168,12 +165,12 @@ def _sought(
     return np.asarray(there, np.float32), found.ravel() == 1, difference.ravel()
 
 
-def _corners(grey: Grey) -> NDArray[np.float32]:
+def _corners(grey: Grey) -> Places:
     """(n, 2) corners of a frame, the best of each of its cells first, so that no thing in it has most of them."""
     found = cv2.goodFeaturesToTrack(grey, 0, _LEAST_CORNER, _CORNERS_APART * math.hypot(*grey.shape))
     if found is None:
         return np.zeros((0, 2), np.float32)
-    xy: NDArray[np.float32] = found.reshape(-1, 2)  # the best first
+    xy: Places = found.reshape(-1, 2)  # the best first
     cell = (_CELLS * xy / grey.shape[::-1]).astype(np.int64) @ [1, _CELLS]
     order = np.argsort(cell, kind="stable")
     rank = np.empty(len(xy), np.int64)
@@ -194,8 +191,8 @@ class KeyFlow:
     """
 
     keys: tuple[int, int]
-    first_xy: NDArray[np.float32]
-    second_xy: NDArray[np.float32]
+    first_xy: Places
+    second_xy: Places
 
 
 @dataclass(frozen=True)
@@ -205,7 +202,7 @@ class _Since:
     frame: FlowFrame
     sharpness: float
     moved: float
-    xy: NDArray[np.float32]
+    xy: Places
     corner: Index
 
 

@@ -78,13 +78,6 @@ def estimate_focal_length(
         The size of its photos and how they are read; its focal length does not matter.
     step_px : float
         Pixels of the photos to one of those that the features were found in.
-    seed : int
-        Of the choice of matches and of the draws.
-
-    Returns
-    -------
-    FocalLength
-        Combined with `USUAL_FOCAL` by their variances.
     """
     side = float(max(camera.width, camera.height))
     usual, spread = float(np.log(USUAL_FOCAL[0])), USUAL_FOCAL[1]

@@ -45,8 +45,6 @@ def matched_of_database(source: Path, database: Path, reconstruction: Reconstruc
         File to make.
     reconstruction : Reconstruction
         Whose photos and cameras count; its measurements are keypoints of the database.
-    seed : int
-        Seed of every random choice.
 
     Raises
     ------

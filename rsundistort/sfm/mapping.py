@@ -66,19 +66,12 @@ def map_photos(
 
     Parameters
     ----------
-    matched : MatchedPhotos
-        Photos with their matches.
     progress : callable, optional
         Called with the number of photos registered so far.
     keypoints : sequence of int or None
         How many of the largest keypoints of each place it, in attempts one after the other; None for all.
     shown : MatchedPhotos, optional
         The photos as they are, where the keypoints of `matched` are not: their pixels are the measurements.
-
-    Returns
-    -------
-    Reconstruction
-        The photos that could be registered.
 
     Raises
     ------
@@ -162,9 +155,7 @@ def _largest(models: Iterable[Any]) -> Any:
 
 
 def _best_model(
-    matched: MatchedPhotos,
-    attempts: Sequence[tuple[int | None, float]],
-    progress: Callable[[int], None] | None,
+    matched: MatchedPhotos, attempts: Sequence[tuple[int | None, float]], progress: Callable[[int], None] | None
 ) -> Any:
     """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None.
 

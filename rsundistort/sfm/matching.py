@@ -64,8 +64,6 @@ def match_photos(
     within_px : float
         Largest distance of verified matches from their epipolar lines, in the pixels of the photos. Pairs that lose
         few matches by that get the geometry of `CLOSE_PX`.
-    seed : int
-        Seed of the verification.
     pairs : (p, 2) int array, optional
         Pairs to match, as `choose_pairs` gives them; by default all.
     """
@@ -83,12 +81,7 @@ def match_photos(
 def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: Index | None = None) -> None:
     """Match and verify further pairs of photos; those that were matched before stay as they are.
 
-    Parameters
-    ----------
-    matched : MatchedPhotos
-        Photos of `match_photos`; gets the matches.
-    within_px, pairs
-        As there.
+    The photos are those of `match_photos`, and get the matches; `within_px` and `pairs` are as there.
     """
     descriptors = [each.descriptors for each in matched.features]
     words = make_codebook(descriptors, matched.seed, num_sampled=_SAMPLED, rounds=_ROUNDS)

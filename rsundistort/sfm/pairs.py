@@ -127,8 +127,6 @@ def global_descriptors(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) 
     ----------
     descriptors : sequence of (n_i, d) uint8 arrays
         RootSIFT of each photo, the strongest first.
-    seed : int
-        Of the choice of descriptors for the codebook.
 
     Returns
     -------

@@ -84,8 +84,6 @@ def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float =
         Points.
     xy_raw : (n, 2) array
         Where the photo shows them, pixels.
-    camera : Camera
-        Its camera.
     step_px : float
         Unit of the thresholds: pixels of this photo to one of the image that the features were found in.
 
@@ -127,10 +125,7 @@ def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -
     ideal, valid = unproject_points(xy_raw, camera, None, "global")
     clock = clock_of(camera, xy_raw)
     borders = np.quantile(clock, np.linspace(0, 1, _PARTS + 1))
-    parts = [
-        valid,
-        *(valid & (clock >= low) & (clock <= high) for low, high in pairwise(borders)),
-    ]
+    parts = [valid, *(valid & (clock >= low) & (clock <= high) for low, high in pairwise(borders))]
     # a world of its own, for the sake of the scale of what is solved
     origin = np.median(points_w, axis=0)
     size = float(np.median(np.linalg.norm(points_w - origin, axis=1))) or 1.0
@@ -209,18 +204,12 @@ class Registration:
 
 
 def register_photos(
-    matched: MatchedPhotos,
-    num_verified: Mapping[tuple[int, int], int],
-    scene: Reconstruction,
-    *,
-    strong: bool = True,
+    matched: MatchedPhotos, num_verified: Mapping[tuple[int, int], int], scene: Reconstruction, *, strong: bool = True
 ) -> Registration:
     """Register photos by what the others show of the scene, each with a motion of its own, where that explains more.
 
     Parameters
     ----------
-    matched : MatchedPhotos
-        Keypoints and matches.
     num_verified : mapping of (first, second) to int
         As `read_num_verified` returns them.
     scene : Reconstruction

@@ -70,8 +70,6 @@ class View:
         The clock's derivative by the pixel's x and y.
     frame_span : float
         How far the clock runs over the frame.
-    focal_px : float
-        Focal length in pixels.
     """
 
     rays: Array
@@ -180,8 +178,6 @@ def find_relative_pose(pair: Pair, phi_sigma: float) -> RelativePose | None:
 
     Parameters
     ----------
-    pair : Pair
-        Matches.
     phi_sigma : float
         Prior standard deviation of the components of phi, radians a frame.
 
@@ -206,8 +202,6 @@ def best_relative_pose(pair: Pair, phi_sigma: float, known: Sequence[RelativePos
 
     Parameters
     ----------
-    pair : Pair
-        Matches.
     phi_sigma : float
         Prior standard deviation of the components of phi, radians a frame.
     known : sequence of RelativePose, optional
@@ -345,9 +339,7 @@ def phi_information(pose: RelativePose, pair: Pair) -> tuple[Array, Array]:
     For noise of one pixel. The gradient is what the prior of an estimate holds against.
     """
     H, g = np.empty((11, 11)), np.empty(11)
-    kernels.pair_system(
-        *pair.arrays, pose.R_21, pose.t_21, _across(pose.t_21), *pose.phi, _WIDTHS_PX[1], H, g
-    )  # fmt: skip
+    kernels.pair_system(*pair.arrays, pose.R_21, pose.t_21, _across(pose.t_21), *pose.phi, _WIDTHS_PX[1], H, g)
     H += 1e-9 * np.diag(np.diag(H)) + 1e-12 * np.eye(11)
     of_pose = np.linalg.solve(H[:5, :5], np.column_stack([H[:5, 5:], g[:5]]))
     return H[5:, 5:] - H[5:, :5] @ of_pose[:, :6], g[5:] - H[5:, :5] @ of_pose[:, 6]

@@ -26,8 +26,6 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     ----------
     matched : MatchedPhotos
         Keypoints and matches of at least the reconstruction's photos.
-    reconstruction : Reconstruction
-        Poses, motions and cameras.
     of_two : bool
         Whether points that only two photos show are among the new ones: `align_tracks` may find them in others.
 

@@ -32,8 +32,6 @@ def photos_beside_breaks(matched: MatchedPhotos, reconstruction: Reconstruction)
 
     Parameters
     ----------
-    matched : MatchedPhotos
-        Photos and their matches.
     reconstruction : Reconstruction
         Poses, motions, and points whose measurements are keypoints of `matched`.
 

@@ -113,10 +113,7 @@ def read_motion_file(path: Path) -> dict[str, list[float] | RowTable]:
 
 
 def simulate_warp(
-    photos: Path | str,
-    out: Path | str,
-    options: WarpOptions | None = None,
-    progress: ProgressCallback | None = None,
+    photos: Path | str, out: Path | str, options: WarpOptions | None = None, progress: ProgressCallback | None = None
 ) -> Solution:
     """Photos as if a rotating camera had taken them, with the truth.
 

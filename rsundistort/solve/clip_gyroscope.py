@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..bundle import BundleResult
@@ -17,6 +16,7 @@ from ..input.key_frames import Clip
 from ..input.stabilisation import Regression
 from ..io.gpmf import has_telemetry
 from ..io.gyro import GyroLog, read_gyro
+from ..model.array_types import Array, Index
 from ..verdict.judge_path import ReadoutTime
 
 __all__ = ["Felt", "felt_gyroscope", "own_gyroscope", "readout_of", "rotations_between"]
@@ -37,7 +37,7 @@ class Felt:
     alignment: GyroAlignment
     log: GyroLog
 
-    def rates(self, result: BundleResult) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    def rates(self, result: BundleResult) -> dict[str, tuple[Array, Array]]:
         """Rates of the frames that it covers, as `FramePath.rates` takes them, about the time of their middle rows."""
         assert result.path is not None
         half = max(0.5 * abs(readout_of(result).seconds), 0.5 * self.log.step_s)
@@ -102,9 +102,7 @@ def felt_gyroscope(result: BundleResult, log: GyroLog | None, around_s: float = 
     return Felt(found, found.in_camera(log))
 
 
-def rotations_between(
-    part: NDArray[np.int64], R_cw: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def rotations_between(part: Index, R_cw: Array) -> tuple[Index, Array]:
     """Neighbouring frames (n, 2) of a part, and the rotations (n, 3) from one to the other; NaN of unknown ones."""
     first = np.flatnonzero(part[1:] == part[:-1])
     rotations = np.full((len(first), 3), np.nan)

@@ -16,6 +16,7 @@ from ..errors import ReconstructionError
 from ..input.key_frames import Clip, flow_frames_of
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.array_types import Array
 from ..model.projection import unproject_points
 from ..sfm.flow import flow_between, from_reduced
 from ..sfm.relative_pose import Pair, RelativePose, View, adjusted_pose
@@ -42,24 +43,19 @@ class FramePair:
 
     Attributes
     ----------
-    camera : Camera
-        Of both.
-    names : tuple of str
-        The frames.
     xy : (2, n, 2) array
         Pixels of the points that were followed from either to the other.
     """
 
     camera: Camera
     names: tuple[str, ...]
-    xy: NDArray[np.float64]
+    xy: Array
 
     @classmethod
     def of(cls, clip: Clip, keys: LoadedPhotos) -> FramePair:
         """The frames of a clip of two."""
         camera = keys.cameras.of(0)
-        number = {name: k for k, name in enumerate(clip.names)}
-        shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
+        shown = dict(zip(clip.places(keys.names).tolist(), (found.xy_raw for found in keys.features), strict=True))
         followed = follow(clip, shown, camera, most=_POINTS)
         first, second = (shown[k][followed.chosen[k]] for k in (0, 1))
         if clip.flows:
@@ -138,14 +134,12 @@ class FramePair:
         return triangulated(replace(found, points_w=np.zeros((n, 3)), observations=_seen(self.xy)), "constant-motion")
 
 
-def _joined(*places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _joined(*places: Array) -> Array:
     """(2, n, 2) pixels in both frames: of points of the first one, there and in the other, then of the second one."""
     return np.stack([np.concatenate(places[::2]), np.concatenate(places[1::2])])
 
 
-def _followed_aligned(
-    clip: Clip, starts: tuple[NDArray[np.float64], NDArray[np.float64]], camera: Camera, rotation: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _followed_aligned(clip: Clip, starts: tuple[Array, Array], camera: Camera, rotation: Array) -> Array:
     """(2, n, 2) pixels of points of both frames that are followed to the other, rotated as the camera did.
 
     A window is sought as it is: one that rolled by ten degrees is found beside its place, if at all.
@@ -162,13 +156,13 @@ def _followed_aligned(
     return (found + 0.5) * step - 0.5
 
 
-def _mapped(H: NDArray[np.floating[Any]], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mapped(H: NDArray[np.floating[Any]], xy: Array) -> Array:
     """Pixels (n, 2) under a homography."""
     x = np.column_stack([xy, np.ones(len(xy))]) @ H.T
     return np.asarray(x[:, :2] / x[:, 2:])
 
 
-def _seen(xy: NDArray[np.float64]) -> Observations:
+def _seen(xy: Array) -> Observations:
     """The measurements (2, n, 2) of both frames."""
     n = xy.shape[1]
     return Observations(np.repeat([0, 1], n), np.tile(np.arange(n), 2), xy.reshape(-1, 2))

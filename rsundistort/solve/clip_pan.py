@@ -7,13 +7,13 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.array_types import Array, Index
 from ..model.projection import unproject_points
 from ..sfm.descriptor_matches import DescriptorIndex, match_descriptors
 from ..sfm.features import Features
@@ -22,7 +22,7 @@ from .clip_tracks import Followed, follow
 
 __all__ = ["rotating_only", "rotation_between", "seen_again"]
 
-_Corners = tuple[NDArray[np.float64], NDArray[np.float64]]
+_Corners = tuple[Array, Array]
 
 # Tolerance for the shutter where frames are rotated onto each other, pixels; and median that may be left when rotations
 # of the lines of both frames are removed, too: the content moves by fifty from key to key, and translation leaves a
@@ -54,8 +54,7 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     # corners of key frames show it in no time, so that the frames between need not be followed
     if corners and not _only_rotates([_beyond_rotation(first, second, camera) for first, second in corners], camera):
         return None
-    number = {name: k for k, name in enumerate(clip.names)}
-    features = {number[name]: found for name, found in zip(keys.names, keys.features, strict=True)}
+    features = dict(zip(clip.places(keys.names).tolist(), keys.features, strict=True))
     shown = {key: found.xy_raw for key, found in features.items()}
     chained = _chained(clip, camera, features)
     if chained is None or 2 * len(chained[2]) < len(clip.names):
@@ -94,7 +93,7 @@ def _only_rotates(left: Sequence[float], camera: Camera) -> bool:
     return len(left) > 0 and bool(np.median(left) * camera.K[0, 0] < _LEFT_PX)
 
 
-def _beyond_rotation(xy_before: NDArray[np.float64], xy_after: NDArray[np.float64], camera: Camera) -> float:
+def _beyond_rotation(xy_before: Array, xy_after: Array, camera: Camera) -> float:
     """Median distance of pixels (n, 2) of two frames, as directions, beyond what rotations of their lines explain."""
     before, after = _directions(xy_before, camera), _directions(xy_after, camera)
     rotation = _agreed_rotation(before, after, _ROOM_PX / float(camera.K[0, 0]))
@@ -103,7 +102,7 @@ def _beyond_rotation(xy_before: NDArray[np.float64], xy_after: NDArray[np.float6
 
 def _chained(
     clip: Clip, camera: Camera, features: dict[int, Features]
-) -> tuple[Followed, dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]] | None:
+) -> tuple[Followed, dict[int, Array], dict[int, Array]] | None:
     """Followed points of key frames, their directions, and the frames' rotations; None if they do not only rotate."""
     shown = {key: found.xy_raw for key, found in features.items()}
     followed = follow(clip, shown, camera)
@@ -139,9 +138,7 @@ def _chained(
     return followed, own, R_cw
 
 
-def seen_again(
-    before: Features, chosen: NDArray[np.int64], after: Features, camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]] | None:
+def seen_again(before: Features, chosen: Index, after: Features, camera: Camera) -> tuple[Array, Index, Array] | None:
     """The rotation from a frame to another one that shows features of it, which of the chosen ones, and their pixels.
 
     None if too few agree on a rotation.
@@ -158,8 +155,8 @@ def seen_again(
 
 
 def _joined(
-    clip: Clip, camera: Camera, followed: Followed, shown: dict[int, NDArray[np.float64]],
-    own: dict[int, NDArray[np.float64]], R_cw: dict[int, NDArray[np.float64]],
+    clip: Clip, camera: Camera, followed: Followed, shown: dict[int, Array],
+    own: dict[int, Array], R_cw: dict[int, Array],
 ) -> Reconstruction:  # fmt: skip
     """The frames with known rotations, and their measurements."""
     placed = np.array(sorted(R_cw))
@@ -183,7 +180,7 @@ def _joined(
     return rec.with_points(np.ones(len(rec.observations), bool))
 
 
-def _directions(xy_raw: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def _directions(xy_raw: Array, camera: Camera) -> Array:
     """(n, 3) unit rays of pixels; NaN where there is none."""
     rays, valid = unproject_points(xy_raw, camera, RowMotion(), "global")
     ahead = np.column_stack([rays, np.ones(len(rays))])
@@ -192,7 +189,7 @@ def _directions(xy_raw: NDArray[np.float64], camera: Camera) -> NDArray[np.float
     return ahead
 
 
-def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], camera: Camera) -> float:
+def _left_by_shutter(before: Array, after: Array, camera: Camera) -> float:
     """Median distance of directions (n, 3) of two frames, beyond what rotations of their lines explain."""
     seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
     if seen.sum() < _LEAST_AGREEING:
@@ -205,9 +202,7 @@ def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], ca
     return float(np.median(size))
 
 
-def _rotations_of_lines(
-    before: NDArray[np.float64], after: NDArray[np.float64], camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rotations_of_lines(before: Array, after: Array, camera: Camera) -> tuple[Array, Array]:
     """The rotation from one frame to another, to first order, and how far directions (n, 3) are off nevertheless (n,).
 
     The lines of both rotate steadily. It begins at what most agree with of all that a few do, then those count less and
@@ -235,18 +230,14 @@ def _rotations_of_lines(
     return Rotation.from_rotvec(-fit[:3]).as_matrix(), size
 
 
-def rotation_between(
-    xy_before: NDArray[np.float64], xy_after: NDArray[np.float64], camera: Camera
-) -> NDArray[np.float64] | None:
+def rotation_between(xy_before: Array, xy_after: Array, camera: Camera) -> Array | None:
     """The rotation vector from directions of pixels (n, 2) to those in another frame; None if none fits."""
     before, after = _directions(xy_before, camera), _directions(xy_after, camera)
     rotation = _agreed_rotation(before, after, _ROOM_PX / float(camera.K[0, 0]))
     return None if rotation is None else np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
-def _agreed_rotation(
-    before: NDArray[np.float64], after: NDArray[np.float64], within: float
-) -> NDArray[np.float64] | None:
+def _agreed_rotation(before: Array, after: Array, within: float) -> Array | None:
     """The rotation that takes most directions (n, 3) to those of another frame; None if too few agree on one."""
     seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
     before, after = before[seen], after[seen]
@@ -265,7 +256,7 @@ def _agreed_rotation(
     return _aligned(before[best], after[best])
 
 
-def _aligned(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+def _aligned(before: Array, after: Array) -> Array:
     """The rotation (3, 3) that takes directions (n, 3) nearest to others (Kabsch 1976)."""
     U, _, Vt = np.linalg.svd(after.T @ before)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)

@@ -7,11 +7,11 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..input.key_frames import Clip, flow_frames_of
 from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.array_types import Array, Index
 from ..model.projection import unproject_points
 from ..sfm.flow import FlowFrame, flow_between
 from ..sfm.resection import resect
@@ -38,12 +38,12 @@ class Followed:
         Pixels.
     """
 
-    def __init__(self, chosen: Mapping[int, NDArray[np.int64]]) -> None:
+    def __init__(self, chosen: Mapping[int, Index]) -> None:
         self.chosen = chosen
         self.frame = self.key = self.place = np.zeros(0, np.int64)
         self.xy_raw = np.zeros((0, 2))
 
-    def of(self, chosen: Mapping[int, NDArray[np.int64]]) -> Followed:
+    def of(self, chosen: Mapping[int, Index]) -> Followed:
         """The same places, by other indices (n,) of the keys' measurements; without points of which it is negative."""
         anew = Followed({key: index[index >= 0] for key, index in chosen.items()})
         place = {key: np.where(index >= 0, np.cumsum(index >= 0) - 1, -1) for key, index in chosen.items()}
@@ -53,7 +53,7 @@ class Followed:
         anew.xy_raw = self.xy_raw[there]
         return anew
 
-    def add(self, found: list[tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]) -> None:
+    def add(self, found: list[tuple[int, Index, Index, Array]]) -> None:
         """The places found of keys' points: key, frames (o,), places (o,) and pixels (o, 2) of each."""
         if not found:
             return
@@ -61,7 +61,7 @@ class Followed:
         self.frame, self.place, self.xy_raw = (np.concatenate(part) for part in parts)
         self.key = np.repeat(np.array(keys, np.int64), [len(frame) for frame in parts[0]])
 
-    def add_more(self, key: int, frame: int, place: NDArray[np.int64], xy_raw: NDArray[np.float64]) -> None:
+    def add_more(self, key: int, frame: int, place: Index, xy_raw: Array) -> None:
         """Places (n,) of a key's points at pixels (n, 2) of one more frame."""
         self.frame = np.concatenate([self.frame, np.full(len(place), frame)])
         self.key = np.concatenate([self.key, np.full(len(place), key)])
@@ -69,9 +69,7 @@ class Followed:
         self.xy_raw = np.concatenate([self.xy_raw, xy_raw])
 
 
-def _spread(
-    xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, int], most: int
-) -> NDArray[np.int64]:  # fmt: skip
+def _spread(xy: Array, worth: Index, size: tuple[int, int], most: int) -> Index:
     """Indices of the points (n, 2) that are followed: the best of each cell of the frame, then the next best."""
     cell = np.clip(_CELLS * (xy + 0.5) / size, 0, _CELLS - 1).astype(int) @ [1, _CELLS]
     order = np.lexsort((-worth, cell))
@@ -111,9 +109,7 @@ def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
     return followed
 
 
-def followed_again(
-    clip: Clip, followed: Followed, before: Reconstruction, reconstruction: Reconstruction
-) -> Followed:  # fmt: skip
+def followed_again(clip: Clip, followed: Followed, before: Reconstruction, reconstruction: Reconstruction) -> Followed:
     """What was followed of a reconstruction's points, of another one's: of features that both measure."""
     mine, chosen = _of_keys(clip, reconstruction), {}
     for key, starts in followed.chosen.items():
@@ -124,29 +120,27 @@ def followed_again(
     return followed.of(chosen)
 
 
-def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, NDArray[np.int64]]:
+def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, Index]:
     """The measurements of each key frame, by its number."""
-    number = {name: k for k, name in enumerate(clip.names)}
-    return {
-        number[name]: each
-        for name, each in zip(rec.image_names, rec.observations.by_photo(rec.num_images), strict=True)
-    }
+    by_photo = rec.observations.by_photo(rec.num_images)
+    return dict(zip(clip.places(rec.image_names).tolist(), by_photo, strict=True))
+
+
+def _poses(clip: Clip, rec: Reconstruction) -> dict[int, tuple[Array, Array]]:
+    """The pose of each frame, by its number."""
+    return dict(zip(clip.places(rec.image_names).tolist(), zip(rec.R_cw, rec.center_w, strict=True), strict=True))
 
 
 def follow(
-    clip: Clip, shown: Mapping[int, NDArray[np.float64]], camera: Camera,
-    worth: Mapping[int, NDArray[np.int64]] | None = None, most: int = _POINTS,
+    clip: Clip, shown: Mapping[int, Array], camera: Camera,
+    worth: Mapping[int, Index] | None = None, most: int = _POINTS,
 ) -> Followed:  # fmt: skip
     """Follow points of key frames to the key frames before and after.
 
     Parameters
     ----------
-    clip : Clip
-        The video.
     shown : mapping of frame number to (n, 2) array
         Points of each key frame, pixels.
-    camera : Camera
-        Of the frames.
     worth : mapping of frame number to (n,) int array, optional
         Worth of the points: of those in the same part of a frame the best are followed; by default the first.
     most : int
@@ -172,11 +166,11 @@ def follow(
 class CameraPoses:
     """Poses between those of some frames of a clip."""
 
-    def __init__(self, clip: Clip, poses: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]]) -> None:
+    def __init__(self, clip: Clip, poses: Mapping[int, tuple[Array, Array]]) -> None:
         self._clip, self._poses = clip, dict(poses)
         self._frames = np.array(sorted(poses))
 
-    def near(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def near(self, frame: int) -> tuple[Array, Array]:
         """A steady motion's pose between the two frames around one, or that of the only neighbour in its part."""
         part = self._clip.part
         after = int(np.searchsorted(self._frames, frame))
@@ -201,19 +195,16 @@ def with_all_frames(
     key frames connect these, as before. Frames that were `placed_before` keep their poses.
     """
     rec, obs = reconstruction, reconstruction.observations
-    number = {name: k for k, name in enumerate(clip.names)}
-    image_of = {number[name]: i for i, name in enumerate(rec.image_names)}
     keys = sorted(followed.chosen)
     start = dict(zip(keys, np.cumsum([0, *(len(followed.chosen[k]) for k in keys)])[:-1].tolist(), strict=True))
     own = np.concatenate([followed.chosen[k] for k in keys])
-    frames = np.array([number[name] for name in rec.image_names])
+    frames = clip.places(rec.image_names)
     points_w = np.concatenate([rec.points_w, rec.points_w[obs.point_idx[own]]])
     point = rec.num_points + np.array([start[k] for k in followed.key.tolist()], np.int64) + followed.place
     at_key = np.concatenate([np.full(len(followed.chosen[k]), k) for k in keys])
-    poses = {k: (rec.R_cw[i], rec.center_w[i]) for k, i in image_of.items()}
+    poses = _poses(clip, rec)
     if placed_before is not None:
-        at = zip(placed_before.image_names, placed_before.R_cw, placed_before.center_w, strict=True)
-        poses = {number[name]: (R, c) for name, R, c in at} | poses
+        poses = _poses(clip, placed_before) | poses
     camera = rec.cameras[0]
     rays, valid = unproject_points(followed.xy_raw, camera, RowMotion(), "global")
     within = _ROOM_PX / float(camera.K[0, 0])

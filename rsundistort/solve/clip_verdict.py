@@ -48,8 +48,6 @@ class FoundPath:
         With the times that the path has.
     result : BundleResult
         Of all frames.
-    options : BundleOptions
-        Those of the adjustment.
     filmed : Stabilisation, optional
         Whether the frames are as the sensor read them, if that was tested.
     felt : Felt, optional
@@ -87,16 +85,10 @@ def judged(
 
     Parameters
     ----------
-    found : FoundPath
-        The path.
-    keys : LoadedPhotos
-        The key frames.
     alone : ReadoutTime
         By the pictures, without a gyroscope.
     telemetry : GyroLog or None
         That of the video itself.
-    log : StageLog
-        Receives the progress.
     at_once : bool
         Whether the frames were read at once.
     """

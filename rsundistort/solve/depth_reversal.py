@@ -66,8 +66,6 @@ def choose_depths(
     ----------
     result : BundleResult
         Of a model with a shutter.
-    options : BundleOptions
-        Of the adjustment.
     progress : callable, optional
         Called with the cost after each step.
     """

@@ -204,8 +204,6 @@ def gaps_between(own: OwnMotions, place: Index, steps: Array, joined: Mask, num_
         Times between them by the file, in times between frames.
     joined : (m - 1,) bool array
         Whether both are of one part.
-    num_frames : int
-        Number of frames of the video.
     rate : float
         Its frame rate, 1/s.
     """

@@ -91,18 +91,12 @@ def solve_photos(
 
     Parameters
     ----------
-    photos : LoadedPhotos
-        Features and cameras.
     shutter_model : str
         Last model of the sequence; "auto": up to rotation, then the model that best predicts held-out measurements.
-    seed : int
-        Seed of every random choice.
     options_of : callable
         Options of the adjustments for a reconstruction, whose cameras have their readout directions.
     scratch : Path
         Folder for the database.
-    log : StageLog
-        Gets the progress.
     remedy : str
         What to do about a critical motion, of `critical.REMEDIES`.
     matching : str
@@ -110,16 +104,12 @@ def solve_photos(
     workers : Workers, optional
         Workers that read the photos again, to align the tracks at full size; without them features keep their
         positions.
-    kept : Kept, optional
-        Results of an earlier run; takes those of this run.
     survey : Survey, optional
         Positions of photos and control points: the frame is then that of the map.
     finer : callable, optional
         As in `place_photos`.
     """
-    mapped, matched = place_photos(
-        photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer
-    )  # fmt: skip
+    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer)
     check_enough(mapped, len(photos.names))
     num_verified = read_num_verified(matched)
     source = TrackSource(matched, photos, workers, mapped_here=True)
@@ -199,9 +189,7 @@ def solve_tracks(
     log.begin("verdict")
     measured = mapped if track_source is None else tracks
     suspects = [] if registrar is None else registrar.suspects(result.reconstruction)
-    verdict = judge(
-        result, global_result, choice, mended, measured, options, strong, suspects, survey is not None
-    )  # fmt: skip
+    verdict = judge(result, global_result, choice, mended, measured, options, strong, suspects, survey is not None)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)

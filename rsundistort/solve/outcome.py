@@ -45,8 +45,6 @@ class Solved:
         Advice for the next shoot, if the poses are critical.
     directions : ReadoutChoice or None
         The readout directions by the measurements, if they were not specified.
-    verdict : Verdict or None
-        How far the results can be trusted.
     shared_ids : sequence of int
         Ids of the cameras that photos share, in all outputs, if not 1, 2, ...; if they vary, the photos' own are
         numbered.
@@ -62,10 +60,6 @@ class Solved:
         The readout time of a video in `solution.json`.
     facts : mapping
         Further options in `solution.json`.
-    survey : Survey or None
-        The georeferencing.
-    georeference : mapping or None
-        The georeferencing in `solution.json`.
     known_motions : KnownMotions or None
         What the photos say of motions that are known from elsewhere; those that they contradict were left out.
     """

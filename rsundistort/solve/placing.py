@@ -48,16 +48,10 @@ def place_photos(
 
     Parameters
     ----------
-    photos : LoadedPhotos
-        Features and cameras.
     scratch : Path
         Folder for the database.
-    log : StageLog
-        Gets the progress.
     seed, matching
         As in `solve_photos`.
-    kept : Kept
-        Takes the results, for resuming.
     with_shutter : bool
         Whether pairs that a shutter hides are verified by relative poses with a shutter.
     of_clip : bool

@@ -59,11 +59,7 @@ class MeasuredReadout:
 
 
 def measure_readout(
-    video: Path | str,
-    options: RunOptions | None = None,
-    progress: ProgressCallback | None = None,
-    *,
-    jobs: int = 0,
+    video: Path | str, options: RunOptions | None = None, progress: ProgressCallback | None = None, *, jobs: int = 0
 ) -> MeasuredReadout:
     """Measure the readout time of a camera from a video that it took; nothing is written.
 
@@ -76,8 +72,6 @@ def measure_readout(
         Any file that FFmpeg decodes.
     options : RunOptions, optional
         `solve.readout_s` is a first guess, known to 2 %: a value that the video does not improve is not measured.
-    progress : callable, optional
-        Called as (stage, done, total).
     jobs : int
         Threads; 0 for all cores.
 

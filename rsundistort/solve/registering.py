@@ -81,8 +81,6 @@ class Registrar:
         Matches, as mapping used them: new tracks overwrite how many of them a free geometry fits.
     wanted : BundleOptions
         Of the adjustments, with the constraints of all photos.
-    log : StageLog
-        Gets the progress.
     """
 
     track_source: TrackSource

@@ -137,12 +137,6 @@ class Outputs:
         The solution in the stored frame, with the rectified cameras.
     reconstruction : Reconstruction
         Poses, points and measurements, and the motions that are corrected.
-    rectifying : RectifyOptions
-        What is done to each photo.
-    options : OutputOptions
-        What is written besides.
-    ids : ModelIds
-        Ids of the COLMAP model.
     applied : mapping of name to int
         EXIF orientations that are applied.
     rgb : PointRgb or None

@@ -60,8 +60,6 @@ class Survey:
         Readout times, in seconds, where time and direction were specified: GPS then gives velocities.
     fit : FittedSimilarity or None
         The similarity that was applied to the reconstruction.
-    notes : sequence of str
-        Remarks.
     """
 
     frame: MapFrame

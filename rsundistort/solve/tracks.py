@@ -55,8 +55,6 @@ class TrackSource:
 
     Attributes
     ----------
-    matched : MatchedPhotos
-        Their features and matches.
     photos : LoadedPhotos or None
         The photos themselves.
     workers : Workers or None

@@ -34,7 +34,7 @@ from .missing_frames import tell_of_gaps, with_gaps
 from .outcome import Solved
 from .placing import place_photos
 from .shaking import held_by_slow_rotations, tell_if_held
-from .tracks import rough_options
+from .tracks import rough_options, tell
 
 __all__ = ["frame_path", "solve_clip"]
 
@@ -82,8 +82,6 @@ def solve_clip(
 
     Parameters
     ----------
-    clip : Clip
-        The video.
     keys : LoadedPhotos
         Its key frames, with their features.
     path : FramePath
@@ -92,8 +90,6 @@ def solve_clip(
         Options of the adjustments for a reconstruction.
     scratch : Path
         Folder for the database.
-    log : StageLog
-        Receives the progress.
     seed, matching
         As in `solve_photos`.
     gyroscope : GyroLog, optional
@@ -101,8 +97,6 @@ def solve_clip(
         are found.
     gyro_offset_s : float
         Where the offset of that log's clock is looked for, as `align_gyro` does around it.
-    kept : Kept, optional
-        Results of an earlier run; takes those of this run.
     at_once : bool
         Whether the frames were read at once, by a global shutter, or have lost their shutter since.
 
@@ -196,15 +190,10 @@ def _with_gyroscope(
     result, options, felt = found.result, found.options, felt_gyroscope(found.result, gyroscope, around_s)
     if felt is not None:
         # its rates are those of the camera, however fast that shakes
-        path = replace(
-            found.path, rates=felt.rates(result), start=result.path_start(), readout=known, held_sigma=0.0
-        )  # fmt: skip
+        path = replace(found.path, rates=felt.rates(result), start=result.path_start(), readout=known, held_sigma=0.0)
         options = replace(options, path=path)
-        result = bundle_adjust(
-            result.reconstruction, "constant-motion",
-            replace(options, outlier_rounds=0, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED),
-            partial(_tell, log, "gyroscope"),
-        )  # fmt: skip
+        how = replace(options, outlier_rounds=0, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
+        result = bundle_adjust(result.reconstruction, "constant-motion", how, partial(tell, log, "gyroscope"))
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
     return replace(found, result=result, options=options, felt=felt)
 
@@ -226,14 +215,9 @@ def _turned(
         if own is not None:
             path = held_by_slow_rotations(clip, result.reconstruction, path, own)
             options = _if_it_focuses(replace(options, path=path), result)
-            result = bundle_adjust(
-                result.reconstruction, "constant-motion",
-                replace(
-                    options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED,
-                    path=replace(path, start=result.path_start()),
-                ),
-                partial(_tell, log, "rotations"),
-            )  # fmt: skip
+            how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
+            how = replace(how, path=replace(path, start=result.path_start()))
+            result = bundle_adjust(result.reconstruction, "constant-motion", how, partial(tell, log, "rotations"))
             dropped = 1 - len(result.reconstruction.observations) / len(start.observations)
             found, explained = FoundPath(clip, result, options), result.sigma_px < _FLOW_PX and dropped < _OUTLIERS
     log.end("rotations", explained=explained)
@@ -251,7 +235,7 @@ def _turned_in_time(
     as_said, rounds = (clip, path), 0
     while True:
         how = _at_first(replace(options, path=path))
-        result = bundle_adjust(start, "constant-motion", how, partial(_tell, log, "rotations"))
+        result = bundle_adjust(start, "constant-motion", how, partial(tell, log, "rotations"))
         # it smooths wild rotations, which leaves an error several times as large as that of the next one
         if result.sigma_px >= _AT_FIRST * _FLOW_PX:
             return result, None, clip, path
@@ -281,10 +265,10 @@ def _of_two(
     # one step determines no spread of steps, and estimates of it would not settle
     options = replace(options_of(start), path=path, prior_sigma_rounds=0)
     rough = replace(_at_first(options), prior_sigma_rounds=0, varying=False)
-    first = bundle_adjust(start, "constant-motion", rough, partial(_tell, log, "path"))
+    first = bundle_adjust(start, "constant-motion", rough, partial(tell, log, "path"))
     options = replace(options, path=replace(path, start=first.path_start()))
     whole = pair.of_all(first.reconstruction)
-    result = bundle_adjust(whole, "constant-motion", options, partial(_tell, log, "path"))
+    result = bundle_adjust(whole, "constant-motion", options, partial(tell, log, "path"))
     log.end("path", points=result.reconstruction.num_points, rms_px=result.rms_px)
     return FoundPath(clip, result, options)
 
@@ -323,7 +307,7 @@ def _travelled(
         else:
             options = _if_it_focuses(replace(options, path=replace(held, start=result.path_start())), result)
             how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
-        result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
+        result = bundle_adjust(whole, "constant-motion", how, partial(tell, log, stage))
         log.end(
             stage, frames=whole.num_images, of_frames=len(clip.names), rms_px=result.rms_px,
             iterations=result.num_iterations, readout_s=readout_of(result).seconds, stop_reason=result.stop_reason,
@@ -360,7 +344,3 @@ def frame_path(clip: Clip, readout: tuple[float, str] | None) -> FramePath:
         known = seconds, (_GIVEN_SIGMA if source == "given" else _TABLE_SIGMA) * seconds
     time = dict(zip(clip.names, clip.time_s.tolist(), strict=True))
     return FramePath(time, clip.frame_s, known, dict(zip(clip.names, clip.part.tolist(), strict=True)))
-
-
-def _tell(log: StageLog, stage: str, _cost: float) -> None:
-    log.tell(stage, 0)

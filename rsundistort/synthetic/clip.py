@@ -8,11 +8,11 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ..errors import FormatError, InputError
+from ..model.array_types import Array
 from ..model.camera import Camera
 from ..model.checks import check_finite
 from ..model.motion import RowMotion
@@ -20,8 +20,6 @@ from .entries import count, kind_of, number, take
 from .flight import look_at
 
 __all__ = ["CLIP_KINDS", "CameraPath", "Clip", "Tremor", "clip_of", "is_clip"]
-
-Array = NDArray[np.float64]
 
 CLIP_KINDS = ("walk", "pan")
 # Intervals of a bend for half a period of the fastest tremor: these follow it to 4e-6 of its amplitude.
@@ -129,10 +127,6 @@ class Clip:
 
     Parameters
     ----------
-    path : CameraPath
-        Of the camera.
-    num_frames : int
-        How many.
     fps : Fraction
         Frames a second.
     readout : float

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FormatError, InputError
 from ..io.gyro import read_gyro
+from ..model.array_types import Array
 from ..model.camera import Camera
 from ..model.checks import check_finite
 from ..model.motion import RowMotion
@@ -27,10 +28,10 @@ _UP = (0.0, 0.0, 1.0)
 class Pose:
     """Pose at mid-frame, the camera that has it, and which way the path goes on there (unit or zero)."""
 
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
+    R_cw: Array
+    center_w: Array
     camera_id: str
-    heading_w: NDArray[np.float64]
+    heading_w: Array
 
 
 def look_at(center_w: ArrayLike, target_w: ArrayLike, roll_deg: float = 0.0, up_w: ArrayLike = _UP) -> NDArray[Any]:
@@ -65,7 +66,7 @@ def look_at(center_w: ArrayLike, target_w: ArrayLike, roll_deg: float = 0.0, up_
     return np.array([cos * right + sin * down, cos * down - sin * right, forward])
 
 
-def _headings(centers: NDArray[np.float64]) -> NDArray[np.float64]:
+def _headings(centers: Array) -> Array:
     """Unit direction (n, 3) in which a path passes through its places; zero for a single place."""
     if len(centers) < 2:
         return np.zeros_like(centers)
@@ -92,9 +93,7 @@ def _listed(entries: list[Any], default_camera: str) -> list[Pose]:
 
 
 def _orbit(entry: dict[str, Any], camera: str) -> list[Pose]:
-    take(
-        entry, "path", ("kind", "center_w", "radius_m", "num", "look_at_w"), ("start_deg", "arc_deg", "roll_deg")
-    )  # fmt: skip
+    take(entry, "path", ("kind", "center_w", "radius_m", "num", "look_at_w"), ("start_deg", "arc_deg", "roll_deg"))
     middle = check_finite(entry["center_w"], (3,), "path: center_w")
     target = check_finite(entry["look_at_w"], (3,), "path: look_at_w")
     radius, arc = number(entry["radius_m"], "path: radius_m"), number(entry.get("arc_deg", 360.0), "path: arc_deg")
@@ -161,7 +160,7 @@ UNSTEADY = {
 }
 
 
-def _directions(rng: np.random.Generator, num: int) -> NDArray[np.float64]:
+def _directions(rng: np.random.Generator, num: int) -> Array:
     axes = rng.normal(size=(num, 3))
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
 

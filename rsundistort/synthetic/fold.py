@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from ..model.array_types import Array
 from ..model.camera import Camera
 from ..model.motion import RowMotion
 from .lens import clock_at, distort_rays, undistort_to_rays
@@ -42,8 +43,6 @@ def check_no_fold(name: str, camera: Camera, motion: RowMotion, depth: ArrayLike
 
     Parameters
     ----------
-    name : str
-        Photo, for the message.
     camera : Camera
         Its size, lens and readout.
     motion : RowMotion
@@ -81,12 +80,12 @@ def check_no_fold(name: str, camera: Camera, motion: RowMotion, depth: ArrayLike
         )
 
 
-def _stations(length: int, num: int) -> NDArray[np.float64]:
+def _stations(length: int, num: int) -> Array:
     """Pixels along a side, whole numbers, with both ends."""
     return np.unique(np.round(np.linspace(0, length - 1, num)))
 
 
-def _nearest(camera: Camera, uv: NDArray[np.float64], depth: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nearest(camera: Camera, uv: Array, depth: Array) -> Array:
     """Smallest depth within the cell of the grid around each of its pixels (n, 2)."""
     if depth.ndim == 0:
         return np.full(len(uv), float(depth))
@@ -99,9 +98,7 @@ def _nearest(camera: Camera, uv: NDArray[np.float64], depth: NDArray[np.float64]
     return np.asarray(nearest[uv[:, 1].astype(int), uv[:, 0].astype(int)], np.float64)
 
 
-def _line_speed(
-    camera: Camera, uv: NDArray[np.float64], motion: RowMotion, inverse_depth: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _line_speed(camera: Camera, uv: Array, motion: RowMotion, inverse_depth: Array) -> Array:
     """Lines (n,) by which the image of what pixels (n, 2) see runs on while one line is read; NaN beyond the lens."""
     K = camera.K
     axis, sign = camera.clock_axis, camera.clock_sign
@@ -115,7 +112,7 @@ def _line_speed(
     fastest = float(np.abs((motion.at(clock + _STEP)[1] - gone) * inverse_depth[:, None]).max()) / _STEP
     step = _STEP / max(1.0, fastest)
 
-    def position(late: float) -> NDArray[np.float64]:
+    def position(late: float) -> Array:
         """Pixels (n, 2) of what the rays see, `late` after its own moment."""
         # X(t) = Exp(theta(t)) (X(0) - way(t)), so the camera's way is rotated by all of the time gone
         rotation, way = motion.at(clock + late)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..model import Camera
+from ..model.array_types import Array
 
 __all__ = ["clock_at", "distort_rays", "undistort_to_rays"]
 
@@ -24,7 +25,7 @@ _TIGHT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
 _ANGLES = np.linspace(0.0, np.pi / 2, 4097)
 
 
-def distort_rays(rays_c: ArrayLike, camera: Camera, K: ArrayLike | None = None) -> NDArray[np.float64]:
+def distort_rays(rays_c: ArrayLike, camera: Camera, K: ArrayLike | None = None) -> Array:
     """Pixels (n, 2) of directions or points (n, 3) of the camera frame, without shutter; K in place of the camera's."""
     _check_lens(camera)
     rays, K = np.asarray(rays_c, np.float64).reshape(-1, 1, 3), np.array(camera.K if K is None else K, np.float64)
@@ -36,7 +37,7 @@ def distort_rays(rays_c: ArrayLike, camera: Camera, K: ArrayLike | None = None) 
     return np.asarray(uv, np.float64).reshape(-1, 2)
 
 
-def undistort_to_rays(uv_raw: ArrayLike, camera: Camera) -> NDArray[np.float64]:
+def undistort_to_rays(uv_raw: ArrayLike, camera: Camera) -> Array:
     """Undistorted normalised coordinates (..., 2) of pixels (..., 2); of a fisheye NaN from 90 degrees on."""
     _check_lens(camera)
     uv, K = np.asarray(uv_raw, np.float64), np.array(camera.K)
@@ -53,7 +54,7 @@ def undistort_to_rays(uv_raw: ArrayLike, camera: Camera) -> NDArray[np.float64]:
     return np.asarray(rays, np.float64).reshape(uv.shape)
 
 
-def clock_at(camera: Camera, lines: NDArray[Any]) -> NDArray[np.float64]:
+def clock_at(camera: Camera, lines: NDArray[Any]) -> Array:
     """The clock when lines are read, by their places along the readout: rows, or columns, in pixels of any shape."""
     axis = camera.clock_axis
     return np.asarray(camera.clock_sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis], np.float64)
@@ -64,7 +65,7 @@ def _check_lens(camera: Camera) -> None:
         raise InputError("the camera has a residual field, which is not simulated; take the key field out of its file")
 
 
-def _fisheye_rays(distorted: NDArray[np.float64], dist: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fisheye_rays(distorted: Array, dist: Array) -> Array:
     """Undistorted from distorted normalised coordinates (..., 2) of a fisheye."""
     k1, k2, k3, k4 = dist if len(dist) else np.zeros(4)
     radius_of = Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])

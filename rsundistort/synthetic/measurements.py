@@ -7,10 +7,11 @@ SciPy's, the lens OpenCV's, and the four readout directions are written out.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..model import Camera, RowMotion
+from ..model.array_types import Array, Mask
 from .lens import distort_rays
 
 __all__ = ["clock_of", "project_rows"]
@@ -21,7 +22,7 @@ _MAX_STEPS = 200
 _STILL = 1e-14
 
 
-def clock_of(readout: str, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+def clock_of(readout: str, seen: Array) -> Array:
     """The clock (n,) of distorted normalised coordinates (n, 2): it runs along the readout."""
     return {
         "top-to-bottom": seen[:, 1],
@@ -33,7 +34,7 @@ def clock_of(readout: str, seen: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def project_rows(
     points_w: ArrayLike, R_cw: ArrayLike, center_w: ArrayLike, motion: RowMotion, camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Pixels where a rolling-shutter photo shows world points: Eq. 2 whole, the clock on the distorted row.
 
     Parameters
@@ -44,8 +45,6 @@ def project_rows(
         Pose that the motion belongs to.
     motion : RowMotion
         Motion during the readout, with its bend.
-    camera : Camera
-        Intrinsics, lens and readout direction.
 
     Returns
     -------

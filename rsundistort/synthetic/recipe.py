@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError
 from ..io.json_text import read_json
+from ..model.array_types import Array
 from ..model.camera import Camera
 from ..model.checks import check_finite, check_rotations, check_whole, frozen
 from ..model.motion import RowMotion
@@ -44,8 +44,6 @@ class View:
         World to camera at the line of the principal point; of a motion with a bend the pose of the nearest steady one.
     center_w : (3,) array
         Centre of the camera then, world units.
-    motion : RowMotion
-        Motion during the readout.
     camera_id : str
         Which of the recipe's cameras took it.
     exposure : float
@@ -53,8 +51,8 @@ class View:
     """
 
     name: str
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
+    R_cw: Array
+    center_w: Array
     motion: RowMotion
     camera_id: str = "1"
     exposure: float = 0.0
@@ -94,14 +92,6 @@ class Recipe:
 
     Parameters
     ----------
-    name : str
-        Name of the recipe.
-    scene : Scene
-        What is there.
-    cameras : dict of id to Camera
-        What takes the photos.
-    views : tuple of View
-        The photos.
     render_options : dict
         Keyword arguments of `render_view`.
     jpeg_quality : int

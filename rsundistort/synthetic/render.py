@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import raycast
 from ..errors import InputError
+from ..model.array_types import Array
 from ..model.camera import Camera
 from ..model.checks import check_finite
 from .lens import clock_at, distort_rays, undistort_to_rays
@@ -26,15 +27,13 @@ __all__ = ["add_noise", "line_poses", "pixel_rays", "render_depth", "render_view
 _STRIP_ROWS = 64  # keeps the sample coordinates of a strip to some 16 MB
 
 
-def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[Array, Array]:
     """Pose of the camera at each sensor line.
 
     Parameters
     ----------
     camera : Camera
         Its readout says whether lines are rows or columns and which is read first.
-    view : View
-        Pose and motion.
     delay : float
         Time after the middle of the line's exposure, in units of the clock.
 
@@ -50,15 +49,11 @@ def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[
     return Rotation.from_rotvec(rotation).as_matrix() @ view.R_cw, view.center_w + way
 
 
-def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[Array, Array]:
     """World rays along which the centres of raw pixels see.
 
     Parameters
     ----------
-    camera : Camera
-        Intrinsics, lens and readout.
-    view : View
-        Pose and motion.
     uv_raw : (n, 2) array
         Raw pixels; between lines the clock runs on.
 
@@ -75,14 +70,14 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
     return view.center_w + way[line], Rotation.from_rotvec(-rotation)[line].apply(rays_c) @ view.R_cw
 
 
-def _develop(radiance: NDArray[np.float64], exposure: float) -> NDArray[np.uint8]:
+def _develop(radiance: Array, exposure: float) -> NDArray[np.uint8]:
     """8-bit BGR of linear RGB radiance: a curve with a soft shoulder that is white at 4, then gamma."""
     x = exposure * radiance
     tone = np.clip(x * (1 + x / 16) / (1 + x), 0, 1)  # Reinhard's curve
     return np.round(255 * tone[..., ::-1] ** (1 / 2.2)).astype(np.uint8)
 
 
-def _footprint(num: int, spread_px: float) -> NDArray[np.float64]:
+def _footprint(num: int, spread_px: float) -> Array:
     """Offsets (num, 2) of a pixel's samples in pixels: a Gaussian in num strata of equal probability.
 
     No two samples share a row or a column of strata: a lattice would render nearly level edges in a few steps only, and
@@ -94,22 +89,12 @@ def _footprint(num: int, spread_px: float) -> NDArray[np.float64]:
 
 
 def render_view(
-    scene: Scene,
-    camera: Camera,
-    view: View,
-    *,
-    samples: int = 16,
-    spread_px: float = 0.6,
-    exposure: float = 1.0,
+    scene: Scene, camera: Camera, view: View, *, samples: int = 16, spread_px: float = 0.6, exposure: float = 1.0
 ) -> NDArray[np.uint8]:
     """The photo that a camera takes of a scene.
 
     Parameters
     ----------
-    scene : Scene
-        What is there.
-    camera : Camera
-        Size, intrinsics, lens and readout.
     view : View
         Pose at mid-frame, motion and exposure: the samples of a pixel are spread over the exposure of its line.
     samples : int

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import raycast
 from ..errors import InputError
+from ..model.array_types import Array, Index
 from ..model.checks import check_fields, check_finite, check_number, frozen
 from .textures import Texture
 
@@ -35,8 +36,6 @@ class Patch:
     ----------
     origin_w, edge_a_w, edge_b_w : (3,) array
         Corner, and the edges from it, in world metres.
-    texture : str
-        Name of a texture of the scene.
     offset_m : (float, float)
         Where on the texture the origin lies, metres along a and b.
     triangle : bool
@@ -46,9 +45,9 @@ class Patch:
         texture's x axis and b along its y axis, both at their true length.
     """
 
-    origin_w: NDArray[np.float64]
-    edge_a_w: NDArray[np.float64]
-    edge_b_w: NDArray[np.float64]
+    origin_w: Array
+    edge_a_w: Array
+    edge_b_w: Array
     texture: str
     offset_m: tuple[float, float] = (0.0, 0.0)
     triangle: bool = False
@@ -135,12 +134,7 @@ def wall(patch: Patch, openings: list[Opening]) -> list[Patch]:
 
 
 def box(
-    center_w: ArrayLike,
-    size_m: ArrayLike,
-    texture: str,
-    yaw_deg: float = 0.0,
-    top: str = "",
-    offset_m: Any = None,
+    center_w: ArrayLike, size_m: ArrayLike, texture: str, yaw_deg: float = 0.0, top: str = "", offset_m: Any = None
 ) -> list[Patch]:
     """The six sides of a box that stands at center_w (of its foot), rotated about the vertical.
 
@@ -205,7 +199,7 @@ class Light:
         for name in ("sun_azimuth_deg", "sun_elevation_deg", "sun_radius_deg", "clouds"):
             check_number(getattr(self, name), f"light: {name}")
 
-    def sun_directions(self, num: int) -> NDArray[np.float64]:
+    def sun_directions(self, num: int) -> Array:
         """Unit vectors (num, 3), world frame, towards points spread over the sun's disc."""
         k = np.arange(num)
         # sunflower spiral, its order mixed so that neighbouring samples of a pixel look at different points
@@ -225,8 +219,7 @@ def _sky_image(light: Light, seed: int) -> NDArray[np.float32]:
     polar = (np.arange(rows) + 0.5)[:, None] / rows * np.pi / 2
     azimuth = ((np.arange(cols) + 0.5)[None, :] / cols - 0.5) * 2 * np.pi
     direction = np.stack(
-        np.broadcast_arrays(np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)),
-        -1,
+        np.broadcast_arrays(np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)), -1
     )
     low = (1 - direction[..., 2]) ** 2.2
     blue, pale = np.array([0.24, 0.42, 0.82]), np.array([0.78, 0.86, 0.95])
@@ -250,11 +243,11 @@ def _sky_image(light: Light, seed: int) -> NDArray[np.float32]:
     return np.asarray(image + (white - image) * 0.85 * cover[..., None], np.float32)
 
 
-def _tree(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def _tree(low: Array, high: Array) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Order of the patches, and bounds (n, 6) and links (n, 3) of a tree of boxes, split at the median."""
     center = (low + high) / 2
     order: list[int] = []
-    bounds: list[NDArray[np.float64]] = []
+    bounds: list[Array] = []
     links: list[list[int]] = []
 
     def grow(members: NDArray[Any]) -> None:
@@ -286,8 +279,6 @@ class Scene:
         World metres, z up.
     textures : dict of str to Texture
         By the names that the patches use.
-    light : Light
-        Sun and sky.
     seed : int
         Of the textures and the clouds.
     """
@@ -375,7 +366,7 @@ class Scene:
             np.array([self.light.sun, self.light.sky, self.light.bounce], float),
         )
 
-    def cast(self, origins_w: ArrayLike, directions_w: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def cast(self, origins_w: ArrayLike, directions_w: ArrayLike) -> tuple[Index, Array]:
         """Nearest surface along rays.
 
         Parameters

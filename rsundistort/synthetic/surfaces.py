@@ -7,10 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import FileError, FormatError, InputError
+from ..model.array_types import Array, Index
 from ..model.checks import check_array, check_finite
 from .entries import count, kind_of, number, take
 from .scene import Opening, Patch, box, wall
@@ -64,9 +64,7 @@ def _flat(entry: Any, where: str, kind: str) -> list[Patch]:
     return wall(patch, openings)
 
 
-def height_field(
-    origin_w: NDArray[np.float64], size_m: NDArray[np.float64], heights_m: NDArray[np.float64], texture: str
-) -> list[Patch]:
+def height_field(origin_w: Array, size_m: Array, heights_m: Array, texture: str) -> list[Patch]:
     """Triangles of a ground of uneven height, its texture laid on from above.
 
     Parameters
@@ -77,8 +75,6 @@ def height_field(
         Extent along the world's x and y.
     heights_m : (rows, cols) array
         At the vertices of a regular grid, rows along y; at least 2 by 2.
-    texture : str
-        Name of a texture.
     """
     rows, cols = heights_m.shape
     if rows < 2 or cols < 2 or min(size_m) <= 0:
@@ -120,12 +116,7 @@ def _height_field(entry: Any, where: str, rng: np.random.Generator) -> list[Patc
     return height_field(origin, size, heights, entry["texture"])
 
 
-def mesh(
-    vertices_w: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    texture: str,
-    uv_m: NDArray[np.float64] | None = None,
-) -> list[Patch]:
+def mesh(vertices_w: Array, faces: Index, texture: str, uv_m: Array | None = None) -> list[Patch]:
     """Patches of a triangle mesh.
 
     Parameters
@@ -134,8 +125,6 @@ def mesh(
         World frame.
     faces : (k, 3) int array
         Counter-clockwise from the front. Triangles without area are left out.
-    texture : str
-        Name of a texture.
     uv_m : (n, 2) array, optional
         Where on the texture each vertex lies, metres. Without it the texture is laid on along the axis that each
         triangle faces most.

@@ -224,13 +224,7 @@ def crate(canvas: _Canvas, *, colour: _Colour, side_m: float = 0.8, weather: flo
     return _weather(canvas, image, weather)
 
 
-def windows(
-    canvas: _Canvas,
-    *,
-    frame_colour: _Colour,
-    pane_m: Sequence[float],
-    panes: Sequence[int],
-) -> _Image:
+def windows(canvas: _Canvas, *, frame_colour: _Colour, pane_m: Sequence[float], panes: Sequence[int]) -> _Image:
     """Sashes of panes (across, up) that mirror a dull sky, one every panes*pane_m; some have curtains."""
     rng = canvas.rng
     x, y = canvas.metres()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array, Index
 from .measurements import project_rows
 from .recipe import Recipe, View
 from .render import pixel_rays
@@ -32,14 +32,14 @@ class TruePoints:
         the point).
     """
 
-    points_w: NDArray[np.float64]
-    frame_idx: NDArray[np.int64]
-    point_idx: NDArray[np.int64]
-    xy_raw: NDArray[np.float64]
-    xy_global: NDArray[np.float64]
+    points_w: Array
+    frame_idx: Index
+    point_idx: Index
+    xy_raw: Array
+    xy_global: Array
 
 
-def _seen(recipe: Recipe, view: View, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+def _seen(recipe: Recipe, view: View, points_w: Array) -> Array:
     """Pixels (n, 2) where a photo shows points; nan where it does not."""
     camera = recipe.camera(view)
     uv, valid = project_rows(points_w, view.R_cw, view.center_w, view.motion, camera)

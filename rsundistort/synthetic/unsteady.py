@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +18,7 @@ from ..errors import FormatError, InputError, RsUndistortWarning
 from ..io.gyro import GyroLog
 from ..io.tables import read_table
 from ..model import Camera, RowMotion
+from ..model.array_types import Array
 from ..model.checks import check_array, check_finite, frozen
 
 __all__ = [
@@ -33,7 +34,6 @@ __all__ = [
     "vibrations",
 ]
 
-Array = NDArray[np.float64]
 #: Rotation vectors and positions (k, 3) at values (k,) of the clock.
 Poses = Callable[[Array], tuple[Array, Array]]
 
@@ -156,10 +156,6 @@ def unsteady(
 
     Parameters
     ----------
-    name : str
-        Photo, for messages.
-    camera : Camera
-        Its clock and its size.
     steady : RowMotion, RowTable or function
         The motion without the following; functions give rotation vectors and positions (k, 3) at values (k,) of the
         clock.

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model import Camera, RowMotion
+from ..model.array_types import Array, Mask
 from .lens import clock_at, distort_rays, undistort_to_rays
 
 __all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
@@ -26,7 +27,7 @@ _TOGETHER = 500_000
 
 def random_phi(
     names: Sequence[str], frame_spans: Sequence[float], sigma_rad: float, seed: int, still: Iterable[str] = ()
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Array]:
     """Random shutter rotations as in the paper's Experiment I: axis uniform, angle over the frame normal.
 
     Parameters
@@ -97,7 +98,7 @@ def warp_mask(camera: Camera, motion: RowMotion | ArrayLike) -> NDArray[np.uint8
     return np.where(_lookup(camera, motion)[1], 255, 0).astype(np.uint8)
 
 
-def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.float32], Mask]:
     """Pixel (h, w, 2) of the photo without motion whose direction each warped pixel saw, and whether it has it."""
     motion = motion if isinstance(motion, RowMotion) else RowMotion(np.asarray(motion, np.float64))
     w, h = camera.width, camera.height
@@ -119,7 +120,7 @@ def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.f
     return source, inside
 
 
-def largest_rectangle(valid: NDArray[np.bool_]) -> tuple[int, int, int, int]:
+def largest_rectangle(valid: Mask) -> tuple[int, int, int, int]:
     """The largest rectangle along the axes that holds valid pixels only.
 
     The maximal-rectangle problem in linear time: row by row each pixel knows how many valid pixels stand above it, and

@@ -109,8 +109,6 @@ def judge(
 
     Parameters
     ----------
-    result : BundleResult
-        The solution.
     global_result : BundleResult, optional
         A global-shutter adjustment of the same measurements, to compare a model that the user named with.
     choice : ModelChoice, optional
@@ -177,10 +175,7 @@ def judge(
 
 
 def _verdict(
-    shutter: str,
-    reasons: list[str],
-    doubtful: Mapping[str, str] | None = None,
-    lens_only: tuple[str, ...] = (),
+    shutter: str, reasons: list[str], doubtful: Mapping[str, str] | None = None, lens_only: tuple[str, ...] = ()
 ) -> Verdict:
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), doubtful or {}, lens_only)
 

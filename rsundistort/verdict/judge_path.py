@@ -117,10 +117,7 @@ def judge_clip(
 
 
 def _contradictions(
-    time: ReadoutTime,
-    vibration_px: float,
-    speeds: BySpeed | None,
-    halves: tuple[ReadoutTime, ReadoutTime] | None,
+    time: ReadoutTime, vibration_px: float, speeds: BySpeed | None, halves: tuple[ReadoutTime, ReadoutTime] | None
 ) -> list[str]:
     """Why the readout time may be wrong, whatever its standard deviation."""
     reasons = []

@@ -50,16 +50,11 @@ class PhotoMotions:
 
 
 def photo_motions(result: BundleResult) -> PhotoMotions:
-    """Estimate the motion of each photo of a solution separately.
+    """Estimate the motion of each photo of a solution with a shutter separately.
 
     Its pose and motion are estimated again from each half of its measurements (left and right, read first and read
     last, the two colours of a chequerboard), with fixed points, under the prior on its motion: one step of Gauss-Newton
     from the solution, which is near.
-
-    Parameters
-    ----------
-    result : BundleResult
-        The solution, with a shutter model.
     """
     rec = result.reconstruction
     nb = motion_end(rec.shutter_model)
@@ -87,14 +82,7 @@ def hidden_px(result: BundleResult, options: BundleOptions) -> float:
     """How far rotations could have displaced pixels of photos that show none: one standard deviation, of half of them.
 
     It is that of rotations under a prior that the photos have not narrowed: where photos are few, an estimate of it
-    says no more than that they show none.
-
-    Parameters
-    ----------
-    result : BundleResult
-        A solution without a shutter.
-    options : BundleOptions
-        Of its adjustment.
+    says no more than that they show none. The solution is one without a shutter.
     """
     prior = options.phi_sigma or BundleOptions().phi_sigma_start
     wide = replace(options, phi_sigma=prior, loss="squared", outlier_rounds=0, sigma_px=result.sigma_px)

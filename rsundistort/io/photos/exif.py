@@ -322,8 +322,6 @@ def exif_of_tiff(data: bytes, without: frozenset[int] = frozenset()) -> bytes:
 
     Parameters
     ----------
-    data : bytes
-        The file.
     without : frozenset of int
         Tags of the Exif IFD to leave out.
 

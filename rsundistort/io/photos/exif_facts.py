@@ -42,8 +42,6 @@ class ExifFacts:
     ----------
     make, model, lens, serial : str or None
         Maker and model of the camera, model of the lens, serial number of the body.
-    focal_mm : float or None
-        Focal length in mm.
     focal_35mm : float or None
         Focal length that sees the same diagonal on 36 x 24 mm.
     sensor_width_mm : float or None
@@ -58,10 +56,6 @@ class ExifFacts:
         When it was taken, by the camera's clock: seconds since the beginning of 1970 there.
     exposure_s : float or None
         How long the shutter was open, seconds.
-    flash : bool or None
-        Whether a flash fired.
-    fix : GpsFix or None
-        Where it was taken, by GPS.
     """
 
     make: str | None = None

@@ -84,8 +84,6 @@ class Photo:
     ----------
     pixels : (h, w) or (h, w, 3 | 4) array
         uint8, uint16 or float32 in OpenCV's channel order (BGR), in the stored frame.
-    metadata : Metadata
-        EXIF, XMP and ICC.
     """
 
     pixels: NDArray[Any]
@@ -319,18 +317,12 @@ def _encode_params(kind: str, quality: int, flat: bool) -> list[int]:
 
 
 def write_image(
-    path: Path,
-    pixels: NDArray[Any],
-    metadata: Metadata | None = None,
-    quality: int = 95,
-    flat: bool = False,
+    path: Path, pixels: NDArray[Any], metadata: Metadata | None = None, quality: int = 95, flat: bool = False
 ) -> None:
     """Write an image of the kind that the path's ending says, whole or not at all.
 
     Parameters
     ----------
-    path : Path
-        File to write.
     pixels, metadata
         As in `Photo`. JPEG and WebP hold 8 bits: 16-bit pixels are rounded to them. What the metadata says of the size
         is made true; its thumbnail, and what it says of other pictures that were in the file, is left out.

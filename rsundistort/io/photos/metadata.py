@@ -18,10 +18,6 @@ class Metadata:
     ----------
     exif : bytes
         TIFF structure, without the head that it has in a JPEG.
-    xmp : bytes
-        Packet.
-    icc : bytes
-        Colour profile.
     """
 
     exif: bytes = b""

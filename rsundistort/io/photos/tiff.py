@@ -14,15 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .exif import (
-    ORIENTATION,
-    Damaged,
-    TiffStructure,
-    described_entries,
-    exif_of_tiff,
-    exif_structure,
-    pack_ifd,
-)
+from .exif import ORIENTATION, Damaged, TiffStructure, described_entries, exif_of_tiff, exif_structure, pack_ifd
 from .metadata import Metadata
 
 __all__ = ["as_stored", "damaged_strips", "encode_tiff", "tiff_metadata"]

@@ -42,8 +42,6 @@ class TiffLayout:
 
     Attributes
     ----------
-    width, height : int
-        In pixels.
     photometric, predictor, compression : int
         Values of their tags.
     bits : int
