@@ -43,7 +43,7 @@ class DescriptorIndex:
 
     descriptors: NDArray[np.uint8]
     order: Index
-    starts: NDArray[np.int64]
+    starts: Index
     near: NDArray[np.uint8]
 
     @classmethod
