@@ -10,9 +10,9 @@ from sift_like import sift_like
 from rsundistort import Camera
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.sfm import Features, MatchedPhotos
-from rsundistort.sfm.codebook import make_codebook
 from rsundistort.sfm.database import write_photos
 from rsundistort.sfm.descriptor_matches import DescriptorIndex, match_descriptors
+from rsundistort.sfm.matching import make_words
 
 CAMERA = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
 
@@ -50,10 +50,6 @@ def matches(first, second, words=None):
     return match_descriptors(DescriptorIndex.of(first, words), DescriptorIndex.of(second, words))
 
 
-def words_of(photos):
-    return make_codebook(photos, 0, num_sampled=8192, rounds=4)
-
-
 def test_they_are_those_of_the_brute_force_matcher(photos, tmp_path):
     expected = brute_force(photos, tmp_path / "database.db")
     assert 50 < len(expected) < 250
@@ -61,13 +57,13 @@ def test_they_are_those_of_the_brute_force_matcher(photos, tmp_path):
 
 
 def test_words_miss_hardly_any(photos):
-    expected, found = ({*map(tuple, matches(*photos, words).tolist())} for words in (None, words_of(photos)))
+    expected, found = ({*map(tuple, matches(*photos, words).tolist())} for words in (None, make_words(photos, 0)))
     assert len(expected - found) <= 0.02 * len(expected)
     assert len(found - expected) <= 0.02 * len(expected)
 
 
 def test_they_are_the_same_whatever_the_number_of_threads(photos):
-    before, found, words = numba.get_num_threads(), [], words_of(photos)
+    before, found, words = numba.get_num_threads(), [], make_words(photos, 0)
     try:
         for threads in (1, numba.config.NUMBA_NUM_THREADS):
             numba.set_num_threads(threads)
@@ -86,6 +82,6 @@ def test_what_looks_alike_twice_is_not_matched(rng):
 
 def test_of_none_or_one_descriptor(rng):
     one = sift_like(rng.normal(0, 1, (1, 128)) ** 2)
-    for words in (None, words_of([one, one[:0]]), words_of([one[:0]])):
+    for words in (None, make_words([one, one[:0]], 0), make_words([one[:0]], 0)):
         assert matches(one, one[:0], words).shape == matches(one[:0], one, words).shape == (0, 2)
         assert matches(one, one, words).tolist() == [[0, 0]]

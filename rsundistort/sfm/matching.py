@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
@@ -84,7 +85,7 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
     The photos are those of `match_photos`, and get the matches; `within_px` and `pairs` are as there.
     """
     descriptors = [each.descriptors for each in matched.features]
-    words = make_codebook(descriptors, matched.seed, num_sampled=_SAMPLED, rounds=_ROUNDS)
+    words = make_words(descriptors, matched.seed)
     index_of = lru_cache(_INDICES)(lambda photo: DescriptorIndex.of(descriptors[photo], words))
     close = close_px(matched.features)
     before = _matched_pairs(matched)
@@ -98,6 +99,11 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
         with quiet_pycolmap().Database.open(matched.database) as db:
             lossy = [pair for pair in new if _loses_matches(db, *pair, close, within_px)]
         _verify(matched, lossy, within_px)
+
+
+def make_words(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.float32]:
+    """Words that descriptors are matched by, of descriptors (n_i, 128) of each photo, the strongest first."""
+    return make_codebook(descriptors, seed, num_sampled=_SAMPLED, rounds=_ROUNDS)
 
 
 def verify_loosely(matched: MatchedPhotos) -> None:
