@@ -159,9 +159,9 @@ def _filmed_by(
     log: StageLog, telemetry: GyroLog | None, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
 ) -> FoundPath:  # fmt: skip
     """The path of the camera: of one that only rotates, through two frames, or of one that travels."""
-    turned, explained = _turned(clip, keys, path, options_of, log)
-    if turned is not None and explained:
-        return turned
+    rotated, explained = _only_rotated(clip, keys, path, options_of, log)
+    if rotated is not None and explained:
+        return rotated
     if len(clip.names) == 2:
         return _of_two(clip, keys, path, options_of, log)
     direction = keys.cameras.of(0).readout
@@ -174,11 +174,11 @@ def _filmed_by(
         found = _travelled(clip, path, options_of, log, telemetry, read_so)
     except ReconstructionError:
         # no scene: rotations that explain neighbours are all that there is
-        if turned is None:
+        if rotated is None:
             raise
-        return turned
-    if turned is not None and _shows_readout(turned) and not _shows_readout(found):
-        return turned
+        return rotated
+    if rotated is not None and _shows_readout(rotated) and not _shows_readout(found):
+        return rotated
     return found
 
 
@@ -198,7 +198,7 @@ def _with_gyroscope(
     return replace(found, result=result, options=options, felt=felt)
 
 
-def _turned(
+def _only_rotated(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
 ) -> tuple[FoundPath | None, bool]:  # fmt: skip
@@ -211,7 +211,7 @@ def _turned(
         # a focal length that the rotations said would absorb wild ones, which the path smooths yet
         said = start.cameras[0] != keys.cameras.of(0)
         rough = replace(options, refine=()) if said else options
-        result, own, clip, path = _turned_in_time(clip, path, start, rough, log)
+        result, own, clip, path = _rotated_in_time(clip, path, start, rough, log)
         if own is not None:
             path = held_by_slow_rotations(clip, result.reconstruction, path, own)
             options = _if_it_focuses(replace(options, path=path), result)
@@ -224,7 +224,7 @@ def _turned(
     return found, explained
 
 
-def _turned_in_time(
+def _rotated_in_time(
     clip: Clip, path: FramePath, start: Reconstruction, options: BundleOptions, log: StageLog
 ) -> tuple[BundleResult, OwnMotions | None, Clip, FramePath]:
     """The first adjustment of frames that only rotate, and their own motions; None if rotations do not explain them.
