@@ -219,6 +219,20 @@ def test_places_that_no_match_agrees_with_are_all_suspect(scene, matched):
 
 
 @pytest.mark.parametrize("rad", [0.02])
+@pytest.mark.parametrize("matches_agree", [True, False])
+def test_where_tracks_connect_no_photo_the_solution_stays(scene, matched, matches_agree, monkeypatch):
+    registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
+    away = replace(scene, R_cw=Rotation.random(scene.num_images, random_state=1).as_matrix())
+    if matches_agree:  # but no photo with two others
+        monkeypatch.setattr(registering, "firmly_connected", lambda rec: rec.take_photos(np.zeros(6, bool)))
+        away = scene
+    start = bundle_adjust(scene, "rotation", rough_options(BundleOptions()))
+    found, left_out = registrar._registered(replace(start, reconstruction=away))
+    assert found.reconstruction.image_names == tuple(NAMES)
+    assert not left_out
+
+
+@pytest.mark.parametrize("rad", [0.02])
 def test_what_a_rejected_mapping_confirms_says_nothing_of_the_solution(scene, matched, monkeypatch):
     registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(with_a_side_turned(scene, 4), "rotation", rough_options(BundleOptions()))

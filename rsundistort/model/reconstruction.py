@@ -64,7 +64,7 @@ class Observations:
     def by_photo(self, num_images: int) -> list[Index]:
         """Indices of the measurements of each photo."""
         order = np.argsort(self.frame_idx, kind="stable")
-        return np.split(order, np.searchsorted(self.frame_idx[order], np.arange(1, num_images)))
+        return np.split(order, np.searchsorted(self.frame_idx[order], np.arange(1, num_images)))[:num_images]
 
     def select(self, keep: NDArray[Any]) -> Observations:
         """The observations that a mask or an index array names."""

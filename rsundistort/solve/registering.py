@@ -131,10 +131,8 @@ class Registrar:
     def suspects(self, reconstruction: Reconstruction) -> list[str]:
         """Photos that may have a wrong place, since matches with the others contradict it."""
         # measurements that were aligned are no keypoints any more
-        try:
-            tracks = self._new_tracks(reconstruction)
-        except ReconstructionError:
-            # not one match agrees with the places
+        tracks = self._new_tracks(reconstruction)
+        if not tracks.num_images:
             return list(reconstruction.image_names)
         beside = np.array(tracks.image_names)[self._breaks(tracks)]
         suspect = np.isin(reconstruction.image_names, [*set(beside.tolist()) - self._confirmed])
@@ -162,6 +160,9 @@ class Registrar:
                 loose = retriangulate(matched, rec).without_photos(LEAST_MEASUREMENTS) if strong else scene
                 result = self._adjusted(loose, result, stage)
                 scene = self._new_tracks(result.reconstruction)
+            if not scene.num_images:  # as a second mapping may leave them: there is nothing to register photos with
+                self.log.end(stage, added=(), moved=(), dropped=())
+                break
             if self._confirms(scene, strong) and not strong:
                 # a lens that moves contradicts as a wrong place does
                 result, scene = before, self._new_tracks(before.reconstruction)
@@ -265,7 +266,11 @@ class Registrar:
         return photos_beside_breaks(self.track_source.matched, tracks)
 
     def _new_tracks(self, reconstruction: Reconstruction) -> Reconstruction:
-        return firmly_connected(retriangulate(self.track_source.matched, reconstruction))
+        """New tracks, and the photos that they connect: none if not one match agrees with the poses."""
+        try:
+            return firmly_connected(retriangulate(self.track_source.matched, reconstruction))
+        except ReconstructionError:
+            return reconstruction.take_photos(np.zeros(reconstruction.num_images, bool))
 
     def _explained(self, reconstruction: Reconstruction) -> int:
         """Measurements by new tracks: those of a mapping are fewer than those that follow it."""
