@@ -233,6 +233,18 @@ def test_where_tracks_connect_no_photo_the_solution_stays(scene, matched, matche
 
 
 @pytest.mark.parametrize("rad", [0.02])
+def test_a_second_mapping_need_not_agree_with_places_that_no_match_agrees_with(scene, matched, monkeypatch):
+    registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
+    start = bundle_adjust(scene, "rotation", rough_options(BundleOptions()))
+    away = replace(scene, R_cw=Rotation.random(scene.num_images, random_state=1).as_matrix())
+    monkeypatch.setattr(registering, "map_without_motions", lambda *_: scene)
+    away = away.take_photos(np.arange(6) < 5)
+    found = registrar._mapped_again(replace(start, reconstruction=away), set())[0].reconstruction
+    assert found.image_names == tuple(NAMES)
+    assert apart_deg(found, scene).max() < 0.5
+
+
+@pytest.mark.parametrize("rad", [0.02])
 def test_what_a_rejected_mapping_confirms_says_nothing_of_the_solution(scene, matched, monkeypatch):
     registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(with_a_side_turned(scene, 4), "rotation", rough_options(BundleOptions()))

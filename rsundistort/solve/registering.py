@@ -199,11 +199,12 @@ class Registrar:
 
         A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The cameras as they came and
         as they were found give two places to start from, and the motions of the photos that are right a third one,
-        which shows those of the others. The other solution must agree with the first one on the photos of both, except
-        suspects, and explain more measurements.
+        which shows those of the others. The other solution must explain more measurements, and agree with the first one
+        on the photos of both, except suspects, and unless what is left of the first one are fewer than half as many.
         """
         rec, matched = result.reconstruction, self.track_source.matched
-        firm = rec.take_photos(~self._suspects(rec))
+        # photos that no tracks connect have no place
+        firm = rec.take_photos(~self._suspects(rec) & np.isin(rec.image_names, self._new_tracks(rec).image_names))
         best, best_left_out, stage = result, left_out, "mapping without motions"
         confirmed = {*self._confirmed}
         for cameras_found, motions_known in ((False, False), (True, False), (True, True)):
@@ -233,7 +234,7 @@ class Registrar:
             other, other_left_out = self._registered(adjusted)
             new = other.reconstruction
             more = new.num_images > firm.num_images and self._explained(new) > self._explained(of_best)
-            if more and agree(firm, new):
+            if more and (2 * firm.num_images < new.num_images or agree(firm, new)):
                 best, best_left_out, confirmed = other, other_left_out, {*self._confirmed}
             self._confirmed.clear()
             self._confirmed.update(confirmed)
