@@ -22,7 +22,7 @@ from rsundistort.sfm.sides import carried_along
 from rsundistort.sfm.verification import pair_of
 from rsundistort.solve import registering
 from rsundistort.solve.registering import Registrar
-from rsundistort.solve.solutions import agree
+from rsundistort.solve.solutions import agree, num_explained, photos_apart
 from rsundistort.solve.tracks import TrackSource, rough_options
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
@@ -255,7 +255,7 @@ def test_what_a_rejected_mapping_confirms_says_nothing_of_the_solution(scene, ma
 
     monkeypatch.setattr(Registrar, "_registered", confirming)
     monkeypatch.setattr(registering, "map_without_motions", lambda *_: scene)
-    monkeypatch.setattr(registering, "agree", lambda *_: False)
+    monkeypatch.setattr(registering, "photos_apart", lambda *_: NAMES)
     assert registrar._mapped_again(start, set())[0] is start
     assert registrar.suspects(start.reconstruction) == ["4.jpg", "5.jpg"]
 
@@ -349,6 +349,10 @@ def test_solutions_agree_in_any_frame_and_on_the_photos_of_both(scene):
     off = scene.R_cw.copy()
     off[2] = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix() @ off[2]
     assert not agree(scene, replace(scene, R_cw=off))
+    assert photos_apart(scene, replace(scene, R_cw=off)) == [NAMES[2]]
+    of_each = [num_explained(scene, without={*NAMES} - {name}) for name in NAMES]
+    assert sum(of_each) == num_explained(scene)
+    assert all(of_each)
     assert not agree(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))
     names = [*NAMES[:2], "other.jpg", *NAMES[3:]]
     assert agree(scene, replace(scene, R_cw=off, image_names=names))

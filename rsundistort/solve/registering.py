@@ -27,7 +27,7 @@ from ..sfm import (
     retriangulate,
 )
 from ..sfm.registration import Registration
-from .solutions import agree, num_explained, same_places
+from .solutions import agree, num_explained, photos_apart, same_places
 from .tracks import (
     LEAST_PHOTOS,
     TrackSource,
@@ -199,8 +199,8 @@ class Registrar:
 
         A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The cameras as they came and
         as they were found give two places to start from, and the motions of the photos that are right a third one,
-        which shows those of the others. The other solution must explain more measurements, and agree with the first one
-        on the photos of both, except suspects, and unless what is left of the first one are fewer than half as many.
+        which shows those of the others. The other solution must explain more measurements even without those of photos
+        that looked another way in the first one and were no suspects: nobody knows where these are wrong.
         """
         rec, matched = result.reconstruction, self.track_source.matched
         # photos that no tracks connect have no place
@@ -233,8 +233,8 @@ class Registrar:
             self._confirmed.clear()  # where photos are in one solution says nothing of the other
             other, other_left_out = self._registered(adjusted)
             new = other.reconstruction
-            more = new.num_images > firm.num_images and self._explained(new) > self._explained(of_best)
-            if more and (2 * firm.num_images < new.num_images or agree(firm, new)):
+            explained = num_explained(self._new_tracks(new), without=photos_apart(firm, new))
+            if new.num_images > firm.num_images and explained > num_explained(self._new_tracks(of_best)):
                 best, best_left_out, confirmed = other, other_left_out, {*self._confirmed}
             self._confirmed.clear()
             self._confirmed.update(confirmed)
@@ -272,10 +272,6 @@ class Registrar:
             return firmly_connected(retriangulate(self.track_source.matched, reconstruction))
         except ReconstructionError:
             return reconstruction.take_photos(np.zeros(reconstruction.num_images, bool))
-
-    def _explained(self, reconstruction: Reconstruction) -> int:
-        """Measurements by new tracks: those of a mapping are fewer than those that follow it."""
-        return num_explained(self._new_tracks(reconstruction))
 
     def _adjusted(self, tracks: Reconstruction, result: BundleResult, stage: str) -> BundleResult:
         return roughly_adjusted(tracks, result, self.wanted, partial(tell, self.log, stage))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -9,7 +11,7 @@ from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
 from ..sfm import SIFT_PX
 
-__all__ = ["agree", "num_explained", "same_places"]
+__all__ = ["agree", "num_explained", "photos_apart", "same_places"]
 
 # Of the noise of features: farther from its prediction no measurement is explained.
 _MOST_SIGMAS = 3.0
@@ -18,19 +20,32 @@ _MOST_SIGMAS = 3.0
 _AGREE_RAD = np.radians(2.0)
 
 
-def num_explained(reconstruction: Reconstruction) -> int:
-    """How many measurements lie as near to their predictions as the noise of features lets them."""
-    residuals, valid = reprojection_residuals(reconstruction)
-    within = _MOST_SIGMAS * SIFT_PX * reconstruction.observations.sigma
-    return int((valid & (np.linalg.norm(residuals, axis=1) <= within)).sum())
+def num_explained(reconstruction: Reconstruction, without: Collection[str] = ()) -> int:
+    """How many measurements lie as near to their predictions as the noise of features lets them.
+
+    Those of some photos can be left out.
+    """
+    rec = reconstruction
+    residuals, valid = reprojection_residuals(rec)
+    within = _MOST_SIGMAS * SIFT_PX * rec.observations.sigma
+    counts = ~np.isin(rec.image_names, [*without])[rec.observations.frame_idx]
+    return int((counts & valid & (np.linalg.norm(residuals, axis=1) <= within)).sum())
 
 
 def agree(rec: Reconstruction, other: Reconstruction) -> bool:
-    """Whether the photos of two solutions look the same ways; where they do not, nobody knows which one is wrong."""
+    """Whether photos of two solutions, of which they share some, look the same ways."""
+    return not {*rec.image_names}.isdisjoint(other.image_names) and not photos_apart(rec, other)
+
+
+def photos_apart(rec: Reconstruction, other: Reconstruction) -> list[str]:
+    """Photos of both solutions that look another way in one than in the other."""
     both = [name for name in rec.image_names if name in other.image_names]
+    if not both:
+        return []
     of_rec, of_other = (each.R_cw[[each.image_names.index(name) for name in both]] for each in (rec, other))
     steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", of_rec, of_other))
-    return len(both) > 0 and bool((steps * steps.mean().inv()).magnitude().max() < _AGREE_RAD)
+    apart = (steps * steps.mean().inv()).magnitude() >= _AGREE_RAD
+    return [name for name, is_apart in zip(both, apart.tolist(), strict=True) if is_apart]
 
 
 def same_places(rec: Reconstruction, other: Reconstruction) -> bool:
