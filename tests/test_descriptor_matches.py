@@ -56,10 +56,10 @@ def test_they_are_those_of_the_brute_force_matcher(photos, tmp_path):
     assert {*map(tuple, matches(*photos).tolist())} == expected
 
 
-def test_words_miss_hardly_any(photos):
-    expected, found = ({*map(tuple, matches(*photos, words).tolist())} for words in (None, make_words(photos, 0)))
-    assert len(expected - found) <= 0.02 * len(expected)
-    assert len(found - expected) <= 0.02 * len(expected)
+def test_words_find_the_same(photos):
+    # 0.1 % are missed in real photos (benchmarks/matching.py), none here
+    words = make_words(photos, 0)
+    np.testing.assert_array_equal(matches(*photos, words), matches(*photos))
 
 
 def test_they_are_the_same_whatever_the_number_of_threads(photos):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ._jit import parallel_kernel, prange
 
 # Numbers of a descriptor; a constant, so that their products are summed by instructions for vectors of bytes.
-_LENGTH = 128
+_NUMBERS = 128
 
 
 @parallel_kernel()
@@ -37,7 +37,7 @@ def most_similar(
         for word in words[i]:
             for j in range(starts[word], starts[word + 1]):
                 total = np.int32(0)
-                for k in range(_LENGTH):
+                for k in range(_NUMBERS):
                     total = np.int32(total + np.int32(of[i, k]) * np.int32(among[j, k]))
                 if total > second:
                     if total > largest:

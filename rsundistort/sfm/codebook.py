@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from ..model.array_types import Array, Index
 
-__all__ = ["NUM_WORDS", "STRONGEST", "distance_from_words", "make_codebook", "sums_by_word"]
+__all__ = ["STRONGEST", "distance_from_words", "make_codebook", "sums_by_word"]
 
-#: Words of a codebook, and features of a photo that count for it.
-NUM_WORDS, STRONGEST = 256, 2048
+#: Features of a photo that count for a codebook.
+STRONGEST = 2048
+# Words of a codebook: no more than a byte can name.
+_NUM_WORDS = 256
 
 
 def make_codebook(
@@ -42,7 +44,7 @@ def make_codebook(
     share = -(-num_sampled // max(1, len(descriptors)))
     strongest = [each[:STRONGEST] for each in descriptors]
     sample = np.concatenate([each[rng.permutation(len(each))[:share]] for each in strongest]).astype(np.float32)
-    words = sample[rng.permutation(len(sample))[:NUM_WORDS]]
+    words = sample[rng.permutation(len(sample))[:_NUM_WORDS]]
     for _ in range(rounds if len(words) else 0):
         sums, counts = sums_by_word(sample, distance_from_words(sample, words).argmin(axis=1), len(words))
         # a word that nothing is nearest to stays where it is

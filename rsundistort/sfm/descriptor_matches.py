@@ -16,8 +16,8 @@ from .codebook import distance_from_words
 
 __all__ = ["DescriptorIndex", "match_descriptors"]
 
-# Length of a descriptor.
-_LENGTH = 512.0
+# Length of a descriptor as a vector.
+_NORM = 512.0
 # Largest angle to the nearest descriptor (rad), and by that to the next one: COLMAP's.
 _FARTHEST, _RATIO = 0.7, 0.8
 # Words of 256 that a descriptor's neighbours are looked for in. Of the matches of herz-jesus-8 and drone 0.1 % are
@@ -95,4 +95,4 @@ def _nearest(of: DescriptorIndex, which: slice | Index, among: DescriptorIndex) 
 
 
 def _angle(product: NDArray[np.int32]) -> Array:
-    return np.asarray(np.arccos(np.minimum(product / _LENGTH**2, 1.0)))
+    return np.asarray(np.arccos(np.minimum(product / _NORM**2, 1.0)))

@@ -84,13 +84,13 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
 
     The photos are those of `match_photos`, and get the matches; `within_px` and `pairs` are as there.
     """
-    descriptors = [each.descriptors for each in matched.features]
-    words = make_words(descriptors, matched.seed)
-    index_of = lru_cache(_INDICES)(lambda photo: DescriptorIndex.of(descriptors[photo], words))
     close = close_px(matched.features)
     before = _matched_pairs(matched)
     asked = combinations(range(len(matched.names)), 2) if pairs is None else np.sort(pairs, axis=1).tolist()
     new = sorted({(first, second) for first, second in asked} - before)
+    descriptors = [each.descriptors for each in matched.features]
+    words = make_words(descriptors, matched.seed)
+    index_of = lru_cache(_INDICES)(lambda photo: DescriptorIndex.of(descriptors[photo], words))
     with quiet_pycolmap().Database.open(matched.database) as db:
         for first, second in new:
             db.write_matches(first + 1, second + 1, match_descriptors(index_of(first), index_of(second)))
