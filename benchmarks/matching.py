@@ -26,9 +26,9 @@ from rsundistort.batch.workers import Workers
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.input.load import LoadedPhotos, load_photos
 from rsundistort.sfm import MatchedPhotos
+from rsundistort.sfm.codebook import make_codebook
 from rsundistort.sfm.database import write_photos
 from rsundistort.sfm.descriptor_matches import DescriptorIndex, match_descriptors
-from rsundistort.sfm.matching import make_words
 
 PHOTOS = Path(__file__).resolve().parents[2] / "shared" / "photos"
 
@@ -38,7 +38,7 @@ Matches = dict[tuple[int, int], set[tuple[int, int]]]
 def ours(photos: LoadedPhotos, by_words: bool) -> Matches:
     """Matches of all pairs; without words all descriptors are compared."""
     descriptors = [each.descriptors for each in photos.features]
-    words = make_words(descriptors, 0) if by_words else None
+    words = make_codebook(descriptors, 0) if by_words else None
     indices = [DescriptorIndex.of(each, words) for each in descriptors]
     return {
         (i, j): {(int(a), int(b)) for a, b in match_descriptors(indices[i], indices[j])}

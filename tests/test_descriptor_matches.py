@@ -10,9 +10,9 @@ from sift_like import sift_like
 from rsundistort import Camera
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.sfm import Features, MatchedPhotos
+from rsundistort.sfm.codebook import make_codebook
 from rsundistort.sfm.database import write_photos
 from rsundistort.sfm.descriptor_matches import DescriptorIndex, match_descriptors
-from rsundistort.sfm.matching import make_words
 
 CAMERA = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
 
@@ -58,12 +58,12 @@ def test_they_are_those_of_the_brute_force_matcher(photos, tmp_path):
 
 def test_words_find_the_same(photos):
     # 0.1 % are missed in real photos (benchmarks/matching.py), none here
-    words = make_words(photos, 0)
+    words = make_codebook(photos, 0)
     np.testing.assert_array_equal(matches(*photos, words), matches(*photos))
 
 
 def test_they_are_the_same_whatever_the_number_of_threads(photos):
-    before, found, words = numba.get_num_threads(), [], make_words(photos, 0)
+    before, found, words = numba.get_num_threads(), [], make_codebook(photos, 0)
     try:
         for threads in (1, numba.config.NUMBA_NUM_THREADS):
             numba.set_num_threads(threads)
@@ -82,6 +82,6 @@ def test_what_looks_alike_twice_is_not_matched(rng):
 
 def test_of_none_or_one_descriptor(rng):
     one = sift_like(rng.normal(0, 1, (1, 128)) ** 2)
-    for words in (None, make_words([one, one[:0]], 0), make_words([one[:0]], 0)):
+    for words in (None, make_codebook([one, one[:0]], 0), make_codebook([one[:0]], 0)):
         assert matches(one, one[:0], words).shape == matches(one[:0], one, words).shape == (0, 2)
         assert matches(one, one, words).tolist() == [[0, 0]]

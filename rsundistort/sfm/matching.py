@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
@@ -31,8 +30,6 @@ CLOSE_PX, LOOSE_PX = 4.0, 4.0 * LOOSE
 # distance. Wide epipolar lines have any direction where there is hardly any parallax: photos that follow each other
 # along a street come out in a wrong place by them, with the same matches.
 _KEPT = 0.95
-# Descriptors that the words are made of, and rounds of k-means: more miss no fewer matches.
-_SAMPLED, _ROUNDS = 8192, 4
 # Photos whose descriptors are kept sorted by words.
 _INDICES = 256
 
@@ -89,7 +86,7 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
     asked = combinations(range(len(matched.names)), 2) if pairs is None else np.sort(pairs, axis=1).tolist()
     new = sorted({(first, second) for first, second in asked} - before)
     descriptors = [each.descriptors for each in matched.features]
-    words = make_words(descriptors, matched.seed)
+    words = make_codebook(descriptors, matched.seed)
     index_of = lru_cache(_INDICES)(lambda photo: DescriptorIndex.of(descriptors[photo], words))
     with quiet_pycolmap().Database.open(matched.database) as db:
         for first, second in new:
@@ -99,11 +96,6 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
         with quiet_pycolmap().Database.open(matched.database) as db:
             lossy = [pair for pair in new if _loses_matches(db, *pair, close, within_px)]
         _verify(matched, lossy, within_px)
-
-
-def make_words(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.float32]:
-    """Words that descriptors are matched by, of descriptors (n_i, 128) of each photo, the strongest first."""
-    return make_codebook(descriptors, seed, num_sampled=_SAMPLED, rounds=_ROUNDS)
 
 
 def verify_loosely(matched: MatchedPhotos) -> None:

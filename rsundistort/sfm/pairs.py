@@ -18,8 +18,6 @@ from .codebook import STRONGEST, distance_from_words, make_codebook, sums_by_wor
 
 __all__ = ["choose_pairs", "global_descriptors"]
 
-# descriptors that the codebook is made of, and rounds of k-means
-_SAMPLED, _ROUNDS = 32768, 10
 # Length of a global descriptor. Sums of products of integers stay below its square, 2^24: float32 is exact to there.
 _LENGTH = 4000.0
 # partners in a sequence (on each side), by place and by similarity
@@ -138,7 +136,7 @@ def global_descriptors(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) 
     H. Jegou et al., Aggregating local image descriptors into compact codes, PAMI 2012; R. Arandjelovic, A. Zisserman,
     All about VLAD, CVPR 2013.
     """
-    words = make_codebook(descriptors, seed, num_sampled=_SAMPLED, rounds=_ROUNDS)
+    words = make_codebook(descriptors, seed)
     if not len(words):
         return np.zeros((len(descriptors), 1), np.int16)
     return np.array([_aggregated(each[:STRONGEST].astype(np.float32), words) for each in descriptors])
