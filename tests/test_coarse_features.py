@@ -9,7 +9,7 @@ import pytest
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.errors import ReconstructionError
-from rsundistort.input.load import load_photos, with_finer_features
+from rsundistort.input.load import OtherFeatures, load_photos
 from rsundistort.io.kept import Kept
 from rsundistort.sfm import read_num_verified
 
@@ -61,7 +61,7 @@ def place(folder):
     with pytest.raises(ReconstructionError):
         placing.place_photos(
             loaded, scratch, log, 0, "auto", Kept(),
-            finer=lambda: with_finer_features(loaded, 8192, Workers(2), log, 1.0),
+            other=OtherFeatures(loaded, 8192, Workers(2), log, 1.0),
         )  # fmt: skip
     return log
 
@@ -77,7 +77,7 @@ def test_photos_that_show_many_features_in_fewer_pixels_are_detected_there(tmp_p
 
 def test_finer_features_are_those_of_photos_that_were_never_coarse(tmp_path):
     folder = write(tmp_path / "in", views(texture(0)))
-    finer = with_finer_features(load(folder, coarse=True), 8192, Workers(2), StageLog(None), 1.0)
+    finer = OtherFeatures(load(folder, coarse=True), 8192, Workers(2), StageLog(None), 1.0).finer()
     assert not finer.coarse
     for one, other in zip(finer.features, load(folder).features, strict=True):
         np.testing.assert_array_equal(one.xy_raw, other.xy_raw)

@@ -16,20 +16,24 @@ from ..batch.workers import Workers
 from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import MAX_MEGAPIXELS, ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
 from ..io.kept import Kept
+from ..io.outputs import work_folder
 from ..io.photos.images import stored_size, unread_pictures
 from ..io.places import local_place
 from ..sfm import (
     DETECTION_MEGAPIXELS,
     Features,
+    ReducedPhoto,
+    detect_affine_features,
     detect_features,
     detection_bytes,
     edge_width_px,
     grey_8_bit,
     other_scenes,
+    reduce_photo,
 )
 from .photo_cameras import PhotoCameras, find_cameras
 
-__all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "load_photos", "with_finer_features"]
+__all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "OtherFeatures", "load_photos"]
 
 #: Longer exposures bound the motion: a camera that rotated much would have blurred the photo.
 LONG_EXPOSURE_S = 1 / 250
@@ -41,6 +45,9 @@ _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
 # has so many features there needs no more pixels, unless too few of them match those of other photos. (A quarter takes
 # 0.85 of the time, and loses 0.8 dB on warped herz-jesus-8.)
 _COARSE, _MANY_FEATURES = 1 / 3, 3000
+
+# Photos for each thread that go to pycolmap at once.
+_AT_ONCE = 4
 
 _NUMBERS = {2: "two", 3: "three"}
 
@@ -62,7 +69,9 @@ class LoadedPhotos:
     edges_px : sequence of float or None
         Width of the steepest edges of each photo whose exposure was so long that it matters.
     coarse : frozenset of str
-        Photos whose features were detected in fewer pixels than allowed; see `with_finer_features`.
+        Photos whose features were detected in fewer pixels than allowed; see `OtherFeatures`.
+    affine : bool
+        Whether features have the shape of their surroundings; see there, too.
     """
 
     names: list[str]
@@ -76,6 +85,7 @@ class LoadedPhotos:
     max_megapixels: float
     edges_px: Sequence[float | None] = ()
     coarse: frozenset[str] = frozenset()
+    affine: bool = False
 
     @property
     def camera_of(self) -> dict[str, int]:
@@ -249,30 +259,92 @@ def load_photos(
     )  # fmt: skip
 
 
-def with_finer_features(
-    photos: LoadedPhotos,
-    max_features: int,
-    workers: Workers,
-    log: StageLog,
-    megapixels: float,
-    kept: Kept | None = None,
-) -> LoadedPhotos:
-    """Photos with features of all pixels that are allowed, where they were loaded with coarse ones."""
-    limits = max_features, megapixels, photos.max_megapixels
-    jobs = [
-        _LoadJob(name, photos.folder / name, photos.mask_of.get(name), *limits, again=True, coarse=False)
-        for name in photos.names
-        if name in photos.coarse
-    ]
-    finer = dict(_read(jobs, "finer features of", workers, log, kept or Kept()))
-    if lost := [each.problem for each in finer.values() if each.features is None]:
-        raise FileError(lost[0])
-    features = [
-        finer[name].features or old if name in finer else old
-        for name, old in zip(photos.names, photos.features, strict=True)
-    ]
-    log.end("features", photos=len(jobs), keypoints=sum(len(each.xy_raw) for each in features))
-    return replace(photos, features=features, coarse=frozenset())
+@dataclass(frozen=True)
+class OtherFeatures:
+    """Other features of photos that are loaded, for those whose own ones match too little.
+
+    Attributes
+    ----------
+    photos : LoadedPhotos
+    max_features, workers, log, megapixels, kept
+        As in `load_photos`.
+    """
+
+    photos: LoadedPhotos
+    max_features: int
+    workers: Workers
+    log: StageLog
+    megapixels: float
+    kept: Kept = field(default_factory=Kept)
+
+    def finer(self) -> LoadedPhotos:
+        """Those of all pixels that are allowed, where they are coarse."""
+        photos = self.photos
+        jobs = [job for job in self._jobs() if job.name in photos.coarse]
+        finer = dict(_read(jobs, "finer features of", self.workers, self.log, self.kept))
+        if lost := [each.problem for each in finer.values() if each.features is None]:
+            raise FileError(lost[0])
+        features = [
+            finer[name].features or old if name in finer else old
+            for name, old in zip(photos.names, photos.features, strict=True)
+        ]
+        return self._with(features, len(jobs), affine=False)
+
+    def affine(self) -> LoadedPhotos:
+        """Those of the shape of their surroundings, which a strong shutter shears: `sfm.affine_features`."""
+        jobs, key = self._jobs(), "affine features of {}".format
+        found: dict[str, Features] = {job.name: old for job in jobs if (old := self.kept.get(key(job.name)))}
+        left = [job for job in jobs if job.name not in found]
+        workers = self.workers
+        if left and not workers.scheduler:
+            workers = workers.fitting("features", max(map(_bytes_of, left)))
+        self.log.begin("features", len(jobs), len(found))
+        results = workers.map(_reduce, left, lambda job, why: _Reduced(problem=f"{job.name}: {why}"))
+        with closing(results):
+            for start in range(0, len(left), _AT_ONCE * workers.jobs):
+                some = left[start : start + _AT_ONCE * workers.jobs]
+                reduced = [next(results) for _ in some]
+                if lost := [each.problem for each in reduced if each.photo is None]:
+                    raise FileError(lost[0])
+                photos = [each.photo for each in reduced if each.photo is not None]
+                with work_folder() as work:
+                    for job, each in zip(
+                        some, detect_affine_features(photos, self.max_features, workers.jobs, work), strict=True
+                    ):
+                        found[job.name] = each
+                        self.kept.put(key(job.name), each)
+                self.log.tell("features", len(found), len(jobs))
+        return self._with([found[job.name] for job in jobs], len(jobs), affine=True)
+
+    def _jobs(self) -> list[_LoadJob]:
+        photos = self.photos
+        limits = self.max_features, self.megapixels, photos.max_megapixels
+        return [
+            _LoadJob(name, photos.folder / name, photos.mask_of.get(name), *limits, again=True, coarse=False)
+            for name in photos.names
+        ]
+
+    def _with(self, features: list[Features], num_photos: int, *, affine: bool) -> LoadedPhotos:
+        self.log.end("features", photos=num_photos, keypoints=sum(len(each.xy_raw) for each in features))
+        return replace(self.photos, features=features, coarse=frozenset(), affine=affine)
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """A photo as features are detected in it, or only the problem with it."""
+
+    photo: ReducedPhoto | None = None
+    problem: str = ""
+
+
+def _reduce(job: _LoadJob) -> _Reduced:
+    try:
+        photo = read_photo(job.source, job.max_megapixels)
+    except FileError as error:
+        return _Reduced(problem=str(error))
+    height, width = photo.pixels.shape[:2]
+    mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
+    return _Reduced(reduce_photo(photo.pixels, mask, job.megapixels))
 
 
 def _read(

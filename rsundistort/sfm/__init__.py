@@ -1,11 +1,21 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
+from .affine_features import detect_affine_features
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
 from .connected import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos, firmly_connected, other_scenes
 from .contradiction import contradicting_photos
 from .database import MatchedPhotos
 from .epipolar import read_num_verified
-from .features import DETECTION_MEGAPIXELS, SIFT_PX, Features, detect_features, detection_bytes, grey_8_bit
+from .features import (
+    DETECTION_MEGAPIXELS,
+    SIFT_PX,
+    Features,
+    ReducedPhoto,
+    detect_features,
+    detection_bytes,
+    grey_8_bit,
+    reduce_photo,
+)
 from .focal_length import USUAL_FOCAL, estimate_focal_length
 from .imported import matched_of_database
 from .mapping import map_photos
@@ -17,7 +27,7 @@ from .retriangulation import retriangulate
 from .scale_breaks import photos_beside_breaks
 from .sharpness import edge_width_px
 from .sides import carried_along
-from .verification import verify_with_shutter
+from .verification import strength_of_shutter, verify_with_shutter
 
 __all__ = [
     "DETECTION_MEGAPIXELS",
@@ -29,6 +39,7 @@ __all__ = [
     "MatchedPhotos",
     "PatchPlaces",
     "PatchSource",
+    "ReducedPhoto",
     "align_tracks",
     "allowed_patches",
     "carried_along",
@@ -36,6 +47,7 @@ __all__ = [
     "connected_photos",
     "contradicting_photos",
     "cut_patches",
+    "detect_affine_features",
     "detect_features",
     "detection_bytes",
     "edge_width_px",
@@ -50,7 +62,9 @@ __all__ = [
     "other_scenes",
     "photos_beside_breaks",
     "read_num_verified",
+    "reduce_photo",
     "register_photos",
     "retriangulate",
+    "strength_of_shutter",
     "verify_with_shutter",
 ]

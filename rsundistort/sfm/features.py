@@ -18,9 +18,12 @@ __all__ = [
     "DETECTION_MEGAPIXELS",
     "SIFT_PX",
     "Features",
+    "ReducedPhoto",
     "detect_features",
     "detection_bytes",
+    "features_of",
     "grey_8_bit",
+    "reduce_photo",
     "size_of_sigma",
     "size_sigma",
 ]
@@ -66,6 +69,27 @@ class Features:
         return Features(self.xy_raw[:count], self.sigma[:count], self.descriptors[:count], self.step_px)
 
 
+@dataclass(frozen=True)
+class ReducedPhoto:
+    """What features are detected in.
+
+    Attributes
+    ----------
+    gray : (h, w) uint8 array
+        Of 8 bits, averaged over areas.
+    mask : (h, w) uint8 array or None
+        No features where it is 0.
+    size : (width, height) of the photo
+    step_px : float
+        As of `Features`.
+    """
+
+    gray: NDArray[np.uint8]
+    mask: NDArray[np.uint8] | None
+    size: tuple[int, int]
+    step_px: float
+
+
 def size_sigma(size: Array) -> Array:
     """Standard deviations of the positions of features of these diameters, relative to the finest ones."""
     return np.asarray(np.hypot(1.0, size / _COARSE_PX))
@@ -98,20 +122,17 @@ def detect_features(
     megapixels : float
         Larger photos are reduced to this size.
     """
+    reduced = reduce_photo(photo, mask, megapixels)
+    gray = reduced.gray
     # the upscaled first octave is off by a quarter of a pixel without the precise option (measured on blobs)
     sift = cv2.SIFT.create(
         nfeatures=0, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6, enable_precise_upscale=True
     )
-    gray = grey_8_bit(photo)
-    # the factor by which the sides are divided
-    shrink = math.sqrt(max(1.0, gray.size / (1e6 * megapixels)))
-    if shrink > 1.0:
-        gray, mask = _shrunk(gray, mask, shrink)
     # descriptors that are not kept cost more than a second pyramid, except where few are left out
     at_once = gray.size < _PIXELS_PER_FEATURE * max_features
-    keypoints, raw = sift.detectAndCompute(gray, mask) if at_once else (sift.detect(gray, mask), None)
+    keypoints, raw = sift.detectAndCompute(gray, reduced.mask) if at_once else (sift.detect(gray, reduced.mask), None)
     if not keypoints:
-        return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8), shrink)
+        return features_of(reduced, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
     x, y, size, angle, response = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints]).T
     # ties by strength and place: the result must not depend on the order of OpenCV's threads
     order = np.lexsort((angle, x, y, -response, -size))[:max_features]
@@ -123,8 +144,25 @@ def detect_features(
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
     descriptors = np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)
     xy, size = np.asarray(cv2.KeyPoint.convert(kept), np.float64), np.array([k.size for k in kept])
-    step = np.array(photo.shape[1::-1]) / gray.shape[::-1]
-    return Features(step * (xy + 0.5) - 0.5, shrink * size_sigma(size), descriptors, shrink)
+    return features_of(reduced, xy, size, descriptors)
+
+
+def reduce_photo(
+    photo: NDArray[Any], mask: NDArray[np.uint8] | None = None, megapixels: float = DETECTION_MEGAPIXELS
+) -> ReducedPhoto:
+    """A photo as features are detected in it, by what `detect_features` takes."""
+    gray, size = grey_8_bit(photo), (photo.shape[1], photo.shape[0])
+    # the factor by which the sides are divided
+    shrink = math.sqrt(max(1.0, gray.size / (1e6 * megapixels)))
+    if shrink > 1.0:
+        gray, mask = _shrunk(gray, mask, shrink)
+    return ReducedPhoto(gray, mask, size, shrink)
+
+
+def features_of(reduced: ReducedPhoto, xy: Array, size: Array, descriptors: NDArray[np.uint8]) -> Features:
+    """Features at places (n, 2) of a reduced photo, integer centres, and of these diameters (n,) there."""
+    step = np.array(reduced.size) / reduced.gray.shape[::-1]
+    return Features(step * (xy + 0.5) - 0.5, reduced.step_px * size_sigma(size), descriptors, reduced.step_px)
 
 
 def detection_bytes(width: int, height: int, megapixels: float = DETECTION_MEGAPIXELS) -> float:

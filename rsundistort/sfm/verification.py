@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from .relative_pose import (
     relative_poses,
 )
 
-__all__ = ["pair_of", "verify_with_shutter"]
+__all__ = ["ShutterStrength", "pair_of", "strength_of_shutter", "verify_with_shutter"]
 
 # So many pairs of the most matches, and so many matches of each, show how strong the shutter is.
 _ASKED, _MATCHES = 6, 300
@@ -32,36 +32,64 @@ _ASKED, _MATCHES = 6, 300
 _STRONG_RAD, _LOST = 0.05, 0.05
 
 
-def verify_with_shutter(matched: MatchedPhotos) -> float:
+class ShutterStrength(NamedTuple):
+    """How strong a shutter is by pairs of photos.
+
+    Attributes
+    ----------
+    spread_rad : float
+        Prior standard deviation of the components of phi, per frame.
+    is_strong : bool
+        Whether relative poses without it lose matches.
+    """
+
+    spread_rad: float
+    is_strong: bool
+
+
+def strength_of_shutter(matched: MatchedPhotos) -> ShutterStrength:
+    """How strong the shutter of photos is, by a few of their pairs."""
+    matches = _matches(matched)
+    most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]
+    if not most:
+        return ShutterStrength(0.0, False)
+    pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in most]
+    poses, spread = relative_poses(pairs)
+    if spread < _STRONG_RAD:
+        return ShutterStrength(spread, False)
+    without = [best_relative_pose(pair, NO_SHUTTER) for pair in pairs]
+    within_px = INLIER_PX * matched.step_px
+    explained = _num_explained(poses, pairs, within_px)
+    return ShutterStrength(spread, _num_explained(without, pairs, within_px) < (1.0 - _LOST) * explained)
+
+
+def verify_with_shutter(matched: MatchedPhotos, strength: ShutterStrength | None = None) -> float:
     """Add to the verified matches those that a relative pose with a shutter explains, where photos rotated by much.
 
-    A few pairs show how strong the shutter is. Pairs of weak ones stay as they are: an essential matrix with loose
-    thresholds takes all that is right there.
+    Pairs of weak ones stay as they are: an essential matrix with loose thresholds takes all that is right there.
 
     Parameters
     ----------
     matched : MatchedPhotos
         Photos with their matches; verified ones are added to its database.
+    strength : ShutterStrength, optional
+        Of these photos, where it is known.
 
     Returns
     -------
     float
         Prior standard deviation of the components of phi, in radians a frame.
     """
-    matches = {pair: found for pair, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
-    most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]
-    if not most:
-        return 0.0
-    pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in most]
-    poses, spread = relative_poses(pairs)
-    if spread >= _STRONG_RAD:
-        without = [best_relative_pose(pair, NO_SHUTTER) for pair in pairs]
-        within_px = INLIER_PX * matched.step_px
-        if _num_explained(without, pairs, within_px) < (1.0 - _LOST) * _num_explained(poses, pairs, within_px):
-            # a geometry that few pixels are wide holds for a part of the frame only
-            verify_loosely(matched)
-            _add_explained(matched, matches, spread)
+    spread, is_strong = strength or strength_of_shutter(matched)
+    if is_strong:
+        # a geometry that few pixels are wide holds for a part of the frame only
+        verify_loosely(matched)
+        _add_explained(matched, _matches(matched), spread)
     return spread
+
+
+def _matches(matched: MatchedPhotos) -> Matches:
+    return {pair: found for pair, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
 
 
 def _num_explained(poses: Sequence[RelativePose | None], pairs: Sequence[Pair], within_px: float) -> int:

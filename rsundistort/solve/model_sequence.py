@@ -28,7 +28,7 @@ from ..bundle import (
 from ..bundle.doubt import steps_after
 from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import RsUndistortWarning
-from ..input.load import LoadedPhotos
+from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
 from ..model import Reconstruction
@@ -85,7 +85,7 @@ def solve_photos(
     workers: Workers | None = None,
     kept: Kept | None = None,
     survey: Survey | None = None,
-    finer: Callable[[], LoadedPhotos] | None = None,
+    other: OtherFeatures | None = None,
 ) -> Solved:
     """Match, map and adjust the model sequence; then remove the shutter from keypoints, make new tracks and adjust.
 
@@ -106,10 +106,10 @@ def solve_photos(
         positions.
     survey : Survey, optional
         Positions of photos and control points: the frame is then that of the map.
-    finer : callable, optional
+    other : OtherFeatures, optional
         As in `place_photos`.
     """
-    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer)
+    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, other=other)
     check_enough(mapped, len(photos.names))
     num_verified = read_num_verified(matched)
     source = TrackSource(matched, photos, workers, mapped_here=True)

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from enum import Enum
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..batch.progress import StageLog
 from ..errors import ReconstructionError
-from ..input.load import LoadedPhotos
+from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..model.array_types import Index
-from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
+from ..sfm import (
+    MatchedPhotos,
+    map_photos,
+    match_photos,
+    read_num_verified,
+    strength_of_shutter,
+    verify_with_shutter,
+)
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, close_px, match_more
 
@@ -32,6 +40,13 @@ _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
 _OF_CLIP = (512, 2048, None)
 
 
+class Wanted(Enum):
+    """Features that photos need, whose own ones match too little."""
+
+    FINER = "of all pixels"
+    AFFINE = "of the shape of their surroundings"
+
+
 def place_photos(
     photos: LoadedPhotos,
     scratch: Path,
@@ -42,7 +57,7 @@ def place_photos(
     *,
     with_shutter: bool = False,
     of_clip: bool = False,
-    finer: Callable[[], LoadedPhotos] | None = None,
+    other: OtherFeatures | None = None,
 ) -> tuple[Reconstruction, MatchedPhotos]:
     """Match photos and map them, as of a global shutter; results of an earlier run are not computed again.
 
@@ -56,18 +71,19 @@ def place_photos(
         Whether pairs that a shutter hides are verified by relative poses with a shutter.
     of_clip : bool
         Whether they are key frames of a video in its order, which differ by little.
-    finer : callable, optional
-        Gives the photos with finer features, for those whose coarse ones match too few of others.
+    other : OtherFeatures, optional
+        Other features: finer ones for photos whose coarse ones match too few of others, and affine ones where the
+        shutter is strong.
     """
     match = partial(
         _match, scratch=scratch, log=log, seed=seed, matching=matching, kept=kept, with_shutter=with_shutter,
-        of_clip=of_clip,
+        of_clip=of_clip, may_ask=other is not None,
     )  # fmt: skip
-    # without finer ones, coarse features have to do
-    matched = match(photos if finer is not None else replace(photos, coarse=frozenset()))
-    if matched is None and finer is not None:
-        matched = match(finer())
-    assert matched is not None
+    # without other ones, coarse features have to do
+    matched = match(photos if other is not None else replace(photos, coarse=frozenset()))
+    while isinstance(matched, Wanted):
+        assert other is not None
+        matched = match(other.finer() if matched is Wanted.FINER else other.affine())
     log.begin("mapping", len(photos.names))
     mapped: Reconstruction | None = kept.get("mapped")
     if mapped is None:
@@ -97,13 +113,14 @@ def _match(
     *,
     with_shutter: bool,
     of_clip: bool,
-) -> MatchedPhotos | None:
-    """Photos matched with each other, as in `place_photos`; None if their features are too coarse for that."""
-    detail = " of coarse features" if photos.coarse else ""
+    may_ask: bool,
+) -> MatchedPhotos | Wanted:
+    """Photos matched with each other, as in `place_photos`; the features that it takes, if it `may_ask` for others."""
+    detail = " of affine features" if photos.affine else " of coarse features" if photos.coarse else ""
     cameras, database = photos.cameras, scratch / f"database{detail.replace(' ', '-')}.db"
     log.begin("matching")
     given = database, photos.names, photos.features, cameras.cameras, cameras.camera_idx
-    counts: dict[str, float] | None = kept.get(f"pairs{detail}")
+    counts: dict[str, Any] | None = kept.get(f"pairs{detail}")
     if counts is not None and kept.get_file(f"database{detail}", database):
         matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
     else:
@@ -119,7 +136,7 @@ def _match(
             rich = sum(count >= _RICH for count in read_num_verified(matched).values())
             if rich < _MOST_OF_THEM * _ASKED:
                 log.end("matching", of="coarse features", rich=False)
-                return None
+                return Wanted.FINER
         pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
         if asks:
             match_more(matched, within_px=within_px, pairs=pairs)
@@ -127,11 +144,16 @@ def _match(
             matched = start(pairs=pairs)
         counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
         if with_shutter:
-            counts["spread_rad"] = verify_with_shutter(matched)
+            strength = strength_of_shutter(matched)
+            counts["spread_rad"], counts["is_strong"] = strength
+            if photos.affine or not may_ask:
+                verify_with_shutter(matched, strength)
         kept.put_file(f"database{detail}", database)
         kept.put(f"pairs{detail}", counts)
     log.end("matching", **counts)
-    return matched if not photos.coarse or _all_are_rich(matched) else None
+    if may_ask and counts.get("is_strong") and not photos.affine:
+        return Wanted.AFFINE
+    return matched if not photos.coarse or _all_are_rich(matched) else Wanted.FINER
 
 
 def _neighbours(count: int) -> Index:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_readouts
 from ..input.key_frames import Clip
-from ..input.load import LoadedPhotos, load_photos, with_finer_features
+from ..input.load import LoadedPhotos, OtherFeatures, load_photos
 from ..input.photo_cameras import camera_file_of
 from ..input.unknown_focal import with_focal_lengths
 from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
@@ -210,14 +209,12 @@ def _solve(
     sizes = [(cameras.of(i).width, cameras.of(i).height) for i in range(len(loaded.names))]
     known = {k: seconds for k, seconds in known_s.items() if cameras.readout_specified[k]}
     clock_s = {name: known[k] for name, k in zip(loaded.names, cameras.camera_idx.tolist(), strict=True) if k in known}
-    finer = partial(
-        with_finer_features, loaded, options.most_features(False), workers, log, options.feature_megapixels, kept
-    )
+    other = OtherFeatures(loaded, options.most_features(False), workers, log, options.feature_megapixels, kept)
     survey = survey_of(solving.crs, solving.control, loaded.names, loaded.facts, sizes, clock_s)
     with work_folder() as work:
         solved = solve_photos(
             loaded, solving.shutter_model, solving.seed, options_of,
-            work, log, solving.remedy, options.matching, workers, kept, survey, finer,
+            work, log, solving.remedy, options.matching, workers, kept, survey, other,
         )  # fmt: skip
     rec = solved.shared
     cameras.check_plausible(rec.cameras)
