@@ -25,7 +25,8 @@ from .relative_pose import (
 
 __all__ = ["ShutterStrength", "pair_of", "strength_of_shutter", "verify_with_shutter"]
 
-# So many pairs of the most matches, and so many matches of each, show how strong the shutter is.
+# So many pairs of the most matches, and so many matches of each, show how strong the shutter is. (Of dslr these would be
+# pairs of the same four photos, which are alike in where they look, and may be in how they moved.)
 _ASKED, _MATCHES = 6, 300
 # Pairs are worth it where photos rotated by so much while they were read, in radians, and where poses without a shutter
 # lose such a share of the matches that they explain with one. What a lens does that nobody knows can look like either.
@@ -50,10 +51,9 @@ class ShutterStrength(NamedTuple):
 def strength_of_shutter(matched: MatchedPhotos) -> ShutterStrength:
     """How strong the shutter of photos is, by a few of their pairs."""
     matches = _matches(matched)
-    most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]
-    if not most:
+    if not matches:
         return ShutterStrength(0.0, False)
-    pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in most]
+    pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in _asked(matches)]
     poses, spread = relative_poses(pairs)
     if spread < _STRONG_RAD:
         return ShutterStrength(spread, False)
@@ -86,6 +86,21 @@ def verify_with_shutter(matched: MatchedPhotos, strength: ShutterStrength | None
         verify_loosely(matched)
         _add_explained(matched, _matches(matched), spread)
     return spread
+
+
+def _asked(matches: Matches) -> list[tuple[int, int]]:
+    """The pairs that are asked: of the most matches, each of other photos as long as there are any."""
+    left, asked = sorted(matches, key=lambda pair: (-len(matches[pair]), pair)), list[tuple[int, int]]()
+    while left and len(asked) < _ASKED:
+        seen, later = set[int](), list[tuple[int, int]]()
+        for pair in left:
+            if seen.isdisjoint(pair):
+                asked.append(pair)
+                seen.update(pair)
+            else:
+                later.append(pair)
+        left = later
+    return asked[:_ASKED]
 
 
 def _matches(matched: MatchedPhotos) -> Matches:
