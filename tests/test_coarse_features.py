@@ -2,9 +2,9 @@
 
 from importlib import import_module
 
-import cv2
 import numpy as np
 import pytest
+from plane_photos import CAMERA, SIZE, texture, views, write
 
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
@@ -13,32 +13,11 @@ from rsundistort.input.load import OtherFeatures, load_photos
 from rsundistort.io.kept import Kept
 from rsundistort.sfm import read_num_verified
 
-SIZE = 960, 720
-CAMERA = "1000,1000,479.5,359.5"
 placing = import_module("rsundistort.solve.placing")
-
-
-def texture(seed, coarseness=2.0):
-    """Grey noise of blobs of one size, larger than a photo."""
-    noise = np.random.default_rng(seed).normal(size=(SIZE[1] + 200, SIZE[0] + 200))
-    smooth = cv2.GaussianBlur(noise, (0, 0), coarseness)
-    return np.clip(128 + 45 * smooth / smooth.std(), 0, 255).astype(np.uint8)
-
-
-def write(folder, photos):
-    folder.mkdir()
-    for number, photo in enumerate(photos):
-        cv2.imwrite(str(folder / f"{number}.png"), photo)
-    return folder
 
 
 def load(folder, **options):
     return load_photos(folder, CAMERA, "top-to-bottom", 8192, Workers(2), StageLog(None), **options)
-
-
-def views(of, count=3, shift=40):
-    """Photos of a plane, each shifted against the one before."""
-    return [of[k * shift : k * shift + SIZE[1], k * shift : k * shift + SIZE[0]] for k in range(count)]
 
 
 @pytest.fixture

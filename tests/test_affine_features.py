@@ -1,0 +1,140 @@
+"""Features of the shape of their surroundings, which photos with a strong shutter get."""
+
+from importlib import import_module
+
+import cv2
+import numpy as np
+import pytest
+from plane_photos import CAMERA, texture, views, write
+
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.errors import FileError, ReconstructionError
+from rsundistort.input.load import OtherFeatures, load_photos
+from rsundistort.io.kept import Kept
+from rsundistort.sfm import detect_affine_features, detect_features, reduce_photo
+from rsundistort.sfm.descriptor_matches import DescriptorIndex, match_descriptors
+from rsundistort.sfm.verification import ShutterStrength
+
+placing = import_module("rsundistort.solve.placing")
+
+# What a camera that rotates by a third of a radian a frame does to lines of a photo.
+SHEAR = np.array([[1.0, 0.4, -50.0], [0.0, 0.75, 40.0]])
+# Small photos, since these features take their time.
+WIDE, HIGH = 480, 360
+
+
+def detect(folder, *photos, threads=2):
+    folder.mkdir()
+    return list(detect_affine_features(photos, 2000, threads, folder))
+
+
+def num_right(one, other):
+    """Matches that the shear explains."""
+    found = match_descriptors(DescriptorIndex.of(one.descriptors), DescriptorIndex.of(other.descriptors))
+    expected = one.xy_raw[found[:, 0]] @ SHEAR[:, :2].T + SHEAR[:, 2]
+    return int((np.linalg.norm(other.xy_raw[found[:, 1]] - expected, axis=1) < 3.0).sum())
+
+
+def test_a_sheared_photo_matches_more_of_them(tmp_path):
+    photo = texture(0, 3.0)[:HIGH, :WIDE]
+    sheared = cv2.warpAffine(photo, SHEAR, (WIDE, HIGH), flags=cv2.INTER_LINEAR)
+    affine = num_right(*detect(tmp_path / "work", reduce_photo(photo), reduce_photo(sheared)))
+    plain = num_right(detect_features(photo, 2000), detect_features(sheared, 2000))
+    assert affine > 60
+    assert affine > 1.5 * plain
+
+
+def test_they_lie_where_others_do(tmp_path):
+    photo = cv2.resize(texture(3)[:HIGH, :WIDE], None, fx=2.0, fy=2.0)
+    (found,) = detect(tmp_path / "work", reduce_photo(photo, megapixels=0.15))
+    plain = detect_features(photo, 8192, megapixels=0.15)
+    assert found.step_px == plain.step_px > 2.0
+    assert (np.diff(found.sigma) <= 0).all()
+    gap = found.xy_raw[:, None] - plain.xy_raw
+    near = np.linalg.norm(gap, axis=2).argmin(1)
+    gap = gap[np.arange(len(gap)), near]
+    same = np.linalg.norm(gap, axis=1) < found.step_px
+    assert same.mean() > 0.5
+    np.testing.assert_allclose(np.median(gap[same], axis=0), 0.0, atol=0.05)
+
+
+def test_masks_and_empty_photos(tmp_path):
+    photo = texture(1)[:HIGH, :WIDE]
+    mask = np.zeros_like(photo)
+    mask[:, 150:300] = 255
+    found, empty = detect(tmp_path / "work", reduce_photo(photo, mask), reduce_photo(np.zeros_like(photo)))
+    assert len(found.xy_raw) > 100
+    assert found.xy_raw[:, 0].min() > 149
+    assert found.xy_raw[:, 0].max() < 300
+    assert empty.descriptors.shape == (0, 128)
+
+
+def test_they_are_the_same_with_any_number_of_threads(tmp_path):
+    photos = [reduce_photo(texture(seed)[:200, :250]) for seed in range(3)]
+    for one, other in zip(
+        detect(tmp_path / "one", *photos, threads=1), detect(tmp_path / "two", *photos, threads=2), strict=True
+    ):
+        np.testing.assert_array_equal(one.xy_raw, other.xy_raw)
+        np.testing.assert_array_equal(one.descriptors, other.descriptors)
+
+
+@pytest.fixture
+def strong(monkeypatch):
+    """The strengths of shutters that photos are verified with, and the photos that are to be mapped."""
+    verified, mapped = [], []
+
+    def take(matched, *_):
+        mapped.append(matched)
+        raise ReconstructionError("not mapped here")
+
+    monkeypatch.setattr(placing, "strength_of_shutter", lambda _: ShutterStrength(0.2, True))
+    monkeypatch.setattr(placing, "verify_with_shutter", lambda _, strength: verified.append(strength))
+    monkeypatch.setattr(placing, "map_photos", take)
+    return verified, mapped
+
+
+def place(folder, kept, scratch, *, asks=True):
+    scratch.mkdir()
+    log = StageLog(None)
+    loaded = load_photos(folder, CAMERA, "top-to-bottom", 1000, Workers(2), log, kept=kept)
+    other = OtherFeatures(loaded, 1000, Workers(2), log, 0.1, kept) if asks else None
+    with pytest.raises(ReconstructionError):
+        placing.place_photos(loaded, scratch, log, 0, "auto", kept, with_shutter=True, other=other)
+    return loaded, log
+
+
+def test_photos_with_a_strong_shutter_get_them(tmp_path, strong):
+    verified, mapped = strong
+    folder = write(tmp_path / "in", views(texture(0)))
+    loaded, log = place(folder, Kept(), tmp_path / "scratch")
+    assert [stage["name"] for stage in log.stages] == ["features", "matching", "features", "matching"]
+    assert verified == [ShutterStrength(0.2, True)]  # what is matched anew is not verified before
+    assert all(np.isclose(each.step_px, 2.63, atol=0.01) for each in mapped[0].features)
+    assert not np.array_equal(mapped[0].features[0].descriptors, loaded.features[0].descriptors)
+
+
+def test_photos_that_cannot_be_read_again_keep_theirs(tmp_path, strong):
+    verified, mapped = strong
+    loaded, _ = place(write(tmp_path / "in", views(texture(0))), Kept(), tmp_path / "scratch", asks=False)
+    assert len(verified) == 1
+    assert all(one is other for one, other in zip(mapped[0].features, loaded.features, strict=True))
+
+
+def test_a_run_that_goes_on_does_not_detect_them_again(tmp_path, strong, monkeypatch):
+    folder, kept = write(tmp_path / "in", views(texture(0))), Kept(tmp_path, "key")
+    kept.begin()
+    place(folder, kept, tmp_path / "first")
+    monkeypatch.setattr("rsundistort.input.load.detect_affine_features", None)
+    _, log = place(folder, kept, tmp_path / "second")
+    assert [stage["name"] for stage in log.stages] == ["features", "matching", "features", "matching"]
+    for one, other in zip(*(each.features for each in strong[1]), strict=True):
+        np.testing.assert_array_equal(one.descriptors, other.descriptors)
+
+
+def test_a_photo_that_is_gone_ends_the_run_in_one_line(tmp_path):
+    folder, log = write(tmp_path / "in", views(texture(0))), StageLog(None)
+    loaded = load_photos(folder, CAMERA, "top-to-bottom", 1000, Workers(2), log)
+    (folder / "1.png").unlink()
+    with pytest.raises(FileError, match=r"1\.png"):
+        OtherFeatures(loaded, 1000, Workers(2), log, 0.1).affine()
