@@ -47,7 +47,7 @@ _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
 _COARSE, _MANY_FEATURES = 1 / 3, 3000
 
 # Photos for each thread that go to pycolmap at once.
-_AT_ONCE = 4
+_AT_ONCE = 2
 
 _NUMBERS = {2: "two", 3: "three"}
 

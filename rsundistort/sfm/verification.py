@@ -25,8 +25,8 @@ from .relative_pose import (
 
 __all__ = ["ShutterStrength", "pair_of", "strength_of_shutter", "verify_with_shutter"]
 
-# So many pairs of the most matches, and so many matches of each, show how strong the shutter is. (Of dslr these would be
-# pairs of the same four photos, which are alike in where they look, and may be in how they moved.)
+# So many pairs of the most matches, and so many matches of each, show how strong the shutter is. Each is of two other
+# photos: those of dslr that match most are four in one place.
 _ASKED, _MATCHES = 6, 300
 # Pairs are worth it where photos rotated by so much while they were read, in radians, and where poses without a shutter
 # lose such a share of the matches that they explain with one. What a lens does that nobody knows can look like either.
