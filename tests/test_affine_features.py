@@ -1,6 +1,7 @@
 """Features of the shape of their surroundings, which photos with a strong shutter get."""
 
 from importlib import import_module
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,9 +15,9 @@ from rsundistort.input.load import OtherFeatures, load_photos
 from rsundistort.io.kept import Kept
 from rsundistort.sfm import detect_affine_features, detect_features, reduce_photo
 from rsundistort.sfm.descriptor_matches import DescriptorIndex, match_descriptors
-from rsundistort.sfm.verification import ShutterStrength
 
 placing = import_module("rsundistort.solve.placing")
+model_sequence = import_module("rsundistort.solve.model_sequence")
 
 # What a camera that rotates by a third of a radian a frame does to lines of a photo.
 SHEAR = np.array([[1.0, 0.4, -50.0], [0.0, 0.75, 40.0]])
@@ -79,57 +80,66 @@ def test_they_are_the_same_with_any_number_of_threads(tmp_path):
         np.testing.assert_array_equal(one.descriptors, other.descriptors)
 
 
-@pytest.fixture
-def strong(monkeypatch):
-    """The strengths of shutters that photos are verified with, and the photos that are to be mapped."""
+def loaded_views(folder, kept):
+    log = StageLog(None)
+    loaded = load_photos(write(folder, views(texture(0))), CAMERA, "top-to-bottom", 1000, Workers(2), log, kept=kept)
+    return OtherFeatures(loaded, 1000, Workers(2), log, 0.1, kept), log
+
+
+def test_photos_get_them_and_are_verified_with_a_shutter(tmp_path, monkeypatch):
     verified, mapped = [], []
 
     def take(matched, *_):
         mapped.append(matched)
         raise ReconstructionError("not mapped here")
 
-    monkeypatch.setattr(placing, "strength_of_shutter", lambda _: ShutterStrength(0.2, True))
-    monkeypatch.setattr(placing, "verify_with_shutter", lambda _, strength: verified.append(strength))
+    monkeypatch.setattr(placing, "verify_with_shutter", lambda _, is_strong: verified.append(is_strong))
     monkeypatch.setattr(placing, "map_photos", take)
-    return verified, mapped
+    other, log = loaded_views(tmp_path / "in", Kept())
+    for photos in (other.photos, other.affine()):
+        with pytest.raises(ReconstructionError):
+            placing.place_photos(photos, tmp_path, log, 0, "auto", Kept(), with_shutter=True)
+    assert verified == [False, True]
+    assert [each.step_px for each in mapped[1].features] == pytest.approx([2.63] * 3, abs=0.01)
+    assert mapped[0].database != mapped[1].database
 
 
-def place(folder, kept, scratch, *, asks=True):
-    scratch.mkdir()
-    log = StageLog(None)
-    loaded = load_photos(folder, CAMERA, "top-to-bottom", 1000, Workers(2), log, kept=kept)
-    other = OtherFeatures(loaded, 1000, Workers(2), log, 0.1, kept) if asks else None
-    with pytest.raises(ReconstructionError):
-        placing.place_photos(loaded, scratch, log, 0, "auto", kept, with_shutter=True, other=other)
-    return loaded, log
-
-
-def test_photos_with_a_strong_shutter_get_them(tmp_path, strong):
-    verified, mapped = strong
-    folder = write(tmp_path / "in", views(texture(0)))
-    loaded, log = place(folder, Kept(), tmp_path / "scratch")
-    assert [stage["name"] for stage in log.stages] == ["features", "matching", "features", "matching"]
-    assert verified == [ShutterStrength(0.2, True)]  # what is matched anew is not verified before
-    assert all(np.isclose(each.step_px, 2.63, atol=0.01) for each in mapped[0].features)
-    assert not np.array_equal(mapped[0].features[0].descriptors, loaded.features[0].descriptors)
-
-
-def test_photos_that_cannot_be_read_again_keep_theirs(tmp_path, strong):
-    verified, mapped = strong
-    loaded, _ = place(write(tmp_path / "in", views(texture(0))), Kept(), tmp_path / "scratch", asks=False)
-    assert len(verified) == 1
-    assert all(one is other for one, other in zip(mapped[0].features, loaded.features, strict=True))
-
-
-def test_a_run_that_goes_on_does_not_detect_them_again(tmp_path, strong, monkeypatch):
-    folder, kept = write(tmp_path / "in", views(texture(0))), Kept(tmp_path, "key")
+def test_a_run_that_goes_on_does_not_detect_them_again(tmp_path, monkeypatch):
+    kept = Kept(tmp_path, "key")
     kept.begin()
-    place(folder, kept, tmp_path / "first")
+    other, _ = loaded_views(tmp_path / "in", kept)
+    first = other.affine()
+    assert first.affine
     monkeypatch.setattr("rsundistort.input.load.detect_affine_features", None)
-    _, log = place(folder, kept, tmp_path / "second")
-    assert [stage["name"] for stage in log.stages] == ["features", "matching", "features", "matching"]
-    for one, other in zip(*(each.features for each in strong[1]), strict=True):
-        np.testing.assert_array_equal(one.descriptors, other.descriptors)
+    for one, again in zip(first.features, other.affine().features, strict=True):
+        np.testing.assert_array_equal(one.descriptors, again.descriptors)
+        np.testing.assert_array_equal(one.xy_raw, again.xy_raw)
+
+
+def solution(num_photos):
+    """A result, or a solution, of so many photos."""
+    rec = SimpleNamespace(num_images=num_photos)
+    return SimpleNamespace(reconstruction=rec, shared=rec)
+
+
+def test_a_solution_by_them_is_taken_if_it_has_more_photos():
+    def chosen(registered, of_affine, total=6):
+        def solve(mapped, track_source):
+            assert (mapped, track_source) == ("mapped", "source")
+            if of_affine is None:
+                raise ReconstructionError("too few")
+            return solution(of_affine)
+
+        source = SimpleNamespace(of_affine=lambda: ("mapped", "source"), matched=SimpleNamespace(names=[""] * total))
+        found = model_sequence._by_affine_features(source, solution(registered), solve)
+        return None if found is None else found.shared.num_images
+
+    assert chosen(4, 5) == 5
+    assert chosen(4, 4) is None
+    assert chosen(4, None) is None  # a mapping that fails changes nothing
+    assert chosen(6, 7) is None  # there is nothing to gain
+    source = SimpleNamespace(of_affine=None, matched=SimpleNamespace(names=["", ""]))
+    assert model_sequence._by_affine_features(source, solution(1), None) is None
 
 
 def test_a_photo_that_is_gone_ends_the_run_in_one_line(tmp_path):

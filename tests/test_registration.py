@@ -204,7 +204,7 @@ def test_a_side_in_a_wrong_place_is_registered_again_with_a_weak_shutter(scene, 
     registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(wrong, "rotation", rough_options(BundleOptions()))
     assert registrar.suspects(start.reconstruction) == ["4.jpg", "5.jpg"]
-    found = registrar.all_registered(start, again=True).reconstruction
+    found = registrar.all_registered(start, again=True)[0].reconstruction
     assert registrar.suspects(found) == []
     assert found.image_names == tuple(NAMES)
     assert apart_deg(found, scene).max() < 0.1
@@ -297,7 +297,7 @@ def test_a_side_of_which_one_photo_alone_can_be_registered_follows_it(scene, mat
     registrar = Registrar(TrackSource(matched, mapped_here=False), BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(with_a_side_turned(scene, 4), "rotation", rough_options(BundleOptions()))
     monkeypatch.setattr(registering, "register_photos", but_for_the_last)
-    found = registrar.all_registered(start, again=False).reconstruction
+    found = registrar.all_registered(start, again=False)[0].reconstruction
     assert sorted(found.image_names) == NAMES
     order = np.argsort(found.image_names)
     assert apart_deg(replace(found, image_names=NAMES, R_cw=found.R_cw[order]), scene).max() < 0.1

@@ -20,7 +20,6 @@ from rsundistort.sfm.relative_pose import (
     find_relative_pose,
     relative_poses,
 )
-from rsundistort.sfm.verification import _asked
 
 CAMERAS = {
     "rows": Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]], [-0.1, 0.02, 0, 0]),
@@ -169,10 +168,3 @@ def test_too_few_matches_have_no_pose(rng):
     xy = matches(rng, camera, np.zeros((2, 3)))[:, :10]
     assert find_relative_pose(pair_of(xy, camera), 0.1) is None
     assert relative_poses([pair_of(xy, camera)])[0] == [None]
-
-
-def test_pairs_that_tell_how_strong_a_shutter_is_are_of_other_photos():
-    counts = {(0, 1): 90, (1, 2): 80, (0, 2): 70, (3, 4): 60, (5, 6): 50, (2, 7): 40, (7, 8): 30}
-    matches = {pair: np.zeros((count, 2), np.int64) for pair, count in counts.items()}
-    assert _asked(matches) == [(0, 1), (3, 4), (5, 6), (2, 7), (1, 2), (7, 8)]
-    assert _asked({(0, 1): matches[0, 1]}) == [(0, 1)]

@@ -78,7 +78,7 @@ def test_it_is_mended(walk, matched):
     tracks = retriangulate(matched, broken(walk, 8, 0.3))
     start = bundle_adjust(tracks, "rotation", rough_options(BundleOptions()))
     assert registrar.suspects(start.reconstruction)
-    rec = registrar.all_registered(start, again=False).reconstruction
+    rec = registrar.all_registered(start, again=False)[0].reconstruction
     assert rec.num_images == COUNT
     assert not registrar.suspects(rec)
     steps = np.linalg.norm(np.diff(rec.center_w, axis=0), axis=1)

@@ -27,7 +27,7 @@ from .retriangulation import retriangulate
 from .scale_breaks import photos_beside_breaks
 from .sharpness import edge_width_px
 from .sides import carried_along
-from .verification import strength_of_shutter, verify_with_shutter
+from .verification import verify_with_shutter
 
 __all__ = [
     "DETECTION_MEGAPIXELS",
@@ -65,6 +65,5 @@ __all__ = [
     "reduce_photo",
     "register_photos",
     "retriangulate",
-    "strength_of_shutter",
     "verify_with_shutter",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,88 +23,49 @@ from .relative_pose import (
     relative_poses,
 )
 
-__all__ = ["ShutterStrength", "pair_of", "strength_of_shutter", "verify_with_shutter"]
+__all__ = ["pair_of", "verify_with_shutter"]
 
-# So many pairs of the most matches, and so many matches of each, show how strong the shutter is. Each is of two other
-# photos: those of dslr that match most are four in one place.
+# So many pairs of the most matches, and so many matches of each, show how strong the shutter is.
 _ASKED, _MATCHES = 6, 300
 # Pairs are worth it where photos rotated by so much while they were read, in radians, and where poses without a shutter
 # lose such a share of the matches that they explain with one. What a lens does that nobody knows can look like either.
 _STRONG_RAD, _LOST = 0.05, 0.05
 
 
-class ShutterStrength(NamedTuple):
-    """How strong a shutter is by pairs of photos.
-
-    Attributes
-    ----------
-    spread_rad : float
-        Prior standard deviation of the components of phi, per frame.
-    is_strong : bool
-        Whether relative poses without it lose matches.
-    """
-
-    spread_rad: float
-    is_strong: bool
-
-
-def strength_of_shutter(matched: MatchedPhotos) -> ShutterStrength:
-    """How strong the shutter of photos is, by a few of their pairs."""
-    matches = _matches(matched)
-    if not matches:
-        return ShutterStrength(0.0, False)
-    pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in _asked(matches)]
-    poses, spread = relative_poses(pairs)
-    if spread < _STRONG_RAD:
-        return ShutterStrength(spread, False)
-    without = [best_relative_pose(pair, NO_SHUTTER) for pair in pairs]
-    within_px = INLIER_PX * matched.step_px
-    explained = _num_explained(poses, pairs, within_px)
-    return ShutterStrength(spread, _num_explained(without, pairs, within_px) < (1.0 - _LOST) * explained)
-
-
-def verify_with_shutter(matched: MatchedPhotos, strength: ShutterStrength | None = None) -> float:
+def verify_with_shutter(matched: MatchedPhotos, is_strong: bool = False) -> float:
     """Add to the verified matches those that a relative pose with a shutter explains, where photos rotated by much.
 
-    Pairs of weak ones stay as they are: an essential matrix with loose thresholds takes all that is right there.
+    A few pairs show how strong the shutter is. Pairs of weak ones stay as they are: an essential matrix with loose
+    thresholds takes all that is right there.
 
     Parameters
     ----------
     matched : MatchedPhotos
         Photos with their matches; verified ones are added to its database.
-    strength : ShutterStrength, optional
-        Of these photos, where it is known.
+    is_strong : bool
+        Whether it is known already that photos rotated by much.
 
     Returns
     -------
     float
         Prior standard deviation of the components of phi, in radians a frame.
     """
-    spread, is_strong = strength or strength_of_shutter(matched)
+    matches = {pair: found for pair, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
+    most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]
+    if not most:
+        return 0.0
+    pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in most]
+    poses, spread = relative_poses(pairs)
+    if not is_strong and spread >= _STRONG_RAD:
+        without = [best_relative_pose(pair, NO_SHUTTER) for pair in pairs]
+        within_px = INLIER_PX * matched.step_px
+        explained = _num_explained(poses, pairs, within_px)
+        is_strong = _num_explained(without, pairs, within_px) < (1.0 - _LOST) * explained
     if is_strong:
         # a geometry that few pixels are wide holds for a part of the frame only
         verify_loosely(matched)
-        _add_explained(matched, _matches(matched), spread)
+        _add_explained(matched, matches, spread)
     return spread
-
-
-def _asked(matches: Matches) -> list[tuple[int, int]]:
-    """The pairs that are asked: of the most matches, each of other photos as long as there are any."""
-    left, asked = sorted(matches, key=lambda pair: (-len(matches[pair]), pair)), list[tuple[int, int]]()
-    while left and len(asked) < _ASKED:
-        seen, later = set[int](), list[tuple[int, int]]()
-        for pair in left:
-            if seen.isdisjoint(pair):
-                asked.append(pair)
-                seen.update(pair)
-            else:
-                later.append(pair)
-        left = later
-    return asked[:_ASKED]
-
-
-def _matches(matched: MatchedPhotos) -> Matches:
-    return {pair: found for pair, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
 
 
 def _num_explained(poses: Sequence[RelativePose | None], pairs: Sequence[Pair], within_px: float) -> int:

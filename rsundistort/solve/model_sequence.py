@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from ..bundle import (
 )
 from ..bundle.doubt import steps_after
 from ..critical import Advice, Remedy, advise, heal, with_remedy
-from ..errors import RsUndistortWarning
+from ..errors import ReconstructionError, RsUndistortWarning
 from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
@@ -36,7 +37,7 @@ from ..sfm import read_num_verified
 from ..verdict import Verdict, judge
 from .outcome import Solved
 from .placing import place_photos
-from .registering import Registrar
+from .registering import Registrar, warn_of_left_out
 from .survey import Survey
 from .tracks import (
     TrackSource,
@@ -107,12 +108,22 @@ def solve_photos(
     survey : Survey, optional
         Positions of photos and control points: the frame is then that of the map.
     other : OtherFeatures, optional
-        As in `place_photos`.
+        Features that photos get whose own ones match too few of others.
     """
-    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, other=other)
+    place = partial(place_photos, log=log, seed=seed, matching=matching, kept=kept or Kept(), with_shutter=True)
+
+    @cache
+    def of_affine() -> tuple[Reconstruction, TrackSource]:
+        assert other is not None
+        folder = scratch / "affine"
+        folder.mkdir()
+        mapped, matched = place(other.affine(), folder)
+        return mapped, TrackSource(matched, photos, workers, mapped_here=True)
+
+    mapped, matched = place(photos, scratch, other=other)
     check_enough(mapped, len(photos.names))
     num_verified = read_num_verified(matched)
-    source = TrackSource(matched, photos, workers, mapped_here=True)
+    source = TrackSource(matched, photos, workers, mapped_here=True, of_affine=None if other is None else of_affine)
     solved = solve_tracks(mapped, photos.cameras, shutter_model, seed, options_of, log, remedy, source, survey)
     lost = photos.unregistered(solved.shared.image_names, num_verified)
     solved = replace(solved, unregistered=lost, camera_of=photos.camera_of)
@@ -148,10 +159,10 @@ def solve_tracks(
     survey : Survey, optional
         As in `solve_photos`.
     """
-    again = partial(
-        solve_tracks, mapped, cameras, shutter_model, seed,
-        log=log, remedy=remedy, track_source=track_source, survey=survey,
-    )  # fmt: skip
+    solve = partial(
+        solve_tracks, cameras=cameras, shutter_model=shutter_model, seed=seed, log=log, remedy=remedy, survey=survey
+    )
+    again = partial(solve, mapped, track_source=track_source)
     directions = _read_out(mapped, cameras, options_of(mapped), log)
     if directions is not None:
         mapped = directions.reconstruction
@@ -169,8 +180,12 @@ def solve_tracks(
     tracks, strong = result.reconstruction, is_strong(result.reconstruction)
     registrar = None if track_source is None else Registrar(track_source, wanted, log)
     if track_source is not None and registrar is not None:
-        result = registrar.all_registered(result, again=survey is None)
+        result, left_out = registrar.all_registered(result, again=survey is None)
         strong = strong or is_strong(result.reconstruction)
+        more = _by_affine_features(track_source, result, partial(solve, options_of=options_of)) if strong else None
+        if more is not None:
+            return more
+        warn_of_left_out(left_out)
         options = of_registered(wanted, result.reconstruction)
         result, tracks, options = retriangulated(track_source, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_rms)
@@ -197,6 +212,19 @@ def solve_tracks(
         result, global_result, cameras, choice, mended, advice, directions, verdict, known_motions=known_motions
     )
     return solved if survey is None else _on_the_map(solved, survey, options)
+
+
+def _by_affine_features(track_source: TrackSource, result: BundleResult, solve: Callable[..., Solved]) -> Solved | None:
+    """The solution of features that a strong shutter leaves as they are, if it has more photos than are registered."""
+    num_registered = result.reconstruction.num_images
+    if track_source.of_affine is None or num_registered == len(track_source.matched.names):
+        return None
+    with suppress(ReconstructionError):
+        mapped, source = track_source.of_affine()
+        solved = solve(mapped, track_source=source)
+        if solved.shared.num_images > num_registered:
+            return solved
+    return None
 
 
 def _healed(

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,14 +16,7 @@ from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..model.array_types import Index
-from ..sfm import (
-    MatchedPhotos,
-    map_photos,
-    match_photos,
-    read_num_verified,
-    strength_of_shutter,
-    verify_with_shutter,
-)
+from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, close_px, match_more
 
@@ -38,13 +29,6 @@ _MANY = 100
 _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
 # Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
 _OF_CLIP = (512, 2048, None)
-
-
-class Wanted(Enum):
-    """Features that photos need, whose own ones match too little."""
-
-    FINER = "of all pixels"
-    AFFINE = "of the shape of their surroundings"
 
 
 def place_photos(
@@ -72,20 +56,20 @@ def place_photos(
     of_clip : bool
         Whether they are key frames of a video in its order, which differ by little.
     other : OtherFeatures, optional
-        Other features: finer ones for photos whose coarse ones match too few of others, and affine ones where the
-        shutter is strong.
+        Finer features, for photos whose coarse ones match too few of others.
     """
     match = partial(
         _match, scratch=scratch, log=log, seed=seed, matching=matching, kept=kept, with_shutter=with_shutter,
-        of_clip=of_clip, may_ask=other is not None,
+        of_clip=of_clip,
     )  # fmt: skip
-    # without other ones, coarse features have to do
+    # without finer ones, coarse features have to do
     matched = match(photos if other is not None else replace(photos, coarse=frozenset()))
-    while isinstance(matched, Wanted):
-        assert other is not None
-        matched = match(other.finer() if matched is Wanted.FINER else other.affine())
+    if matched is None and other is not None:
+        matched = match(other.finer())
+    assert matched is not None
     log.begin("mapping", len(photos.names))
-    mapped: Reconstruction | None = kept.get("mapped")
+    key = f"mapped{_detail(photos)}" if photos.affine else "mapped"
+    mapped: Reconstruction | None = kept.get(key)
     if mapped is None:
         try:
             keypoints = _OF_CLIP if of_clip else PLACING_KEYPOINTS
@@ -98,7 +82,7 @@ def place_photos(
                 "the photos overlap, but show no parallax: the camera stood still or only rotated; "
                 "use photos from places apart"
             ) from error
-        kept.put("mapped", mapped)
+        kept.put(key, mapped)
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
     return mapped, matched
 
@@ -113,14 +97,13 @@ def _match(
     *,
     with_shutter: bool,
     of_clip: bool,
-    may_ask: bool,
-) -> MatchedPhotos | Wanted:
-    """Photos matched with each other, as in `place_photos`; the features that it takes, if it `may_ask` for others."""
-    detail = " of affine features" if photos.affine else " of coarse features" if photos.coarse else ""
+) -> MatchedPhotos | None:
+    """Photos matched with each other, as in `place_photos`; None if their features are too coarse for that."""
+    detail = _detail(photos)
     cameras, database = photos.cameras, scratch / f"database{detail.replace(' ', '-')}.db"
     log.begin("matching")
     given = database, photos.names, photos.features, cameras.cameras, cameras.camera_idx
-    counts: dict[str, Any] | None = kept.get(f"pairs{detail}")
+    counts: dict[str, float] | None = kept.get(f"pairs{detail}")
     if counts is not None and kept.get_file(f"database{detail}", database):
         matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
     else:
@@ -136,7 +119,7 @@ def _match(
             rich = sum(count >= _RICH for count in read_num_verified(matched).values())
             if rich < _MOST_OF_THEM * _ASKED:
                 log.end("matching", of="coarse features", rich=False)
-                return Wanted.FINER
+                return None
         pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
         if asks:
             match_more(matched, within_px=within_px, pairs=pairs)
@@ -144,16 +127,17 @@ def _match(
             matched = start(pairs=pairs)
         counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
         if with_shutter:
-            strength = strength_of_shutter(matched)
-            counts["spread_rad"], counts["is_strong"] = strength
-            if photos.affine or not may_ask:
-                verify_with_shutter(matched, strength)
+            # only photos that turned out to have a strong shutter get affine features
+            counts["spread_rad"] = verify_with_shutter(matched, is_strong=photos.affine)
         kept.put_file(f"database{detail}", database)
         kept.put(f"pairs{detail}", counts)
     log.end("matching", **counts)
-    if may_ask and counts.get("is_strong") and not photos.affine:
-        return Wanted.AFFINE
-    return matched if not photos.coarse or _all_are_rich(matched) else Wanted.FINER
+    return matched if not photos.coarse or _all_are_rich(matched) else None
+
+
+def _detail(photos: LoadedPhotos) -> str:
+    """Which features they have, for the names of what is kept."""
+    return " of affine features" if photos.affine else " of coarse features" if photos.coarse else ""
 
 
 def _neighbours(count: int) -> Index:

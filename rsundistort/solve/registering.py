@@ -39,12 +39,21 @@ from .tracks import (
     tell,
 )
 
-__all__ = ["Registrar"]
+__all__ = ["Registrar", "warn_of_left_out"]
 
 # Rounds of registration: photos that are registered make others possible.
 _MOST_WAVES = 4
 # Models with motions that poses without a shutter may be wrong by.
 _MODELS = "rotation", "constant-motion"
+
+
+def warn_of_left_out(names: Collection[str]) -> None:
+    """Say which photos are left out, since they contradict the others."""
+    if names:
+        warnings.warn(
+            f"left out, since they contradict the other photos: {', '.join(sorted(names))}",
+            RsUndistortWarning, stacklevel=4,
+        )  # fmt: skip
 
 
 @dataclass
@@ -93,14 +102,14 @@ class Registrar:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_num_verified", read_num_verified(self.track_source.matched))
 
-    def all_registered(self, result: BundleResult, *, again: bool) -> BundleResult:
+    def all_registered(self, result: BundleResult, *, again: bool) -> tuple[BundleResult, set[str]]:
         """The solution with as many photos as can be registered; `again` by a second mapping, whose frame is another.
 
-        That takes a shutter that is strong, or was before photos lost their poses, or photos that may have a wrong
-        place.
+        With it come those that are left out, since they contradict the others. A second mapping takes a shutter that is
+        strong, or was before photos lost their poses, or photos that may have a wrong place.
         """
         if result.reconstruction.shutter_model not in _MODELS:
-            return result
+            return result, set()
         strong, before = is_strong(result.reconstruction), result
         result, left_out = self._registered(result)
         if self._is_worse(result.reconstruction, before.reconstruction):
@@ -109,12 +118,7 @@ class Registrar:
         again = again and self.track_source.mapped_here
         if again and (strong or left_out or self._suspects(result.reconstruction).any()):
             result, left_out = self._mapped_again(result, left_out)
-        if left_out:
-            names = ", ".join(sorted(left_out))
-            warnings.warn(
-                f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=4
-            )
-        return result
+        return result, left_out
 
     def _is_worse(self, new: Reconstruction, old: Reconstruction) -> bool:
         """Whether the same photos explain fewer measurements in new places: then these are wrong, and not the old.

@@ -62,12 +62,15 @@ class TrackSource:
     mapped_here : bool
         Whether the photos were mapped by us, in an arbitrary frame, so that they may be mapped once more. The frame of
         a model that somebody gave is kept.
+    of_affine : callable or None
+        Gives a mapping, and the source, of features that a strong shutter leaves as they are; None if there are none.
     """
 
     matched: MatchedPhotos
     photos: LoadedPhotos | None = None
     workers: Workers | None = None
     mapped_here: bool = False
+    of_affine: Callable[[], tuple[Reconstruction, TrackSource]] | None = None
 
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
         """The tracks of a reconstruction, aligned at full size."""
