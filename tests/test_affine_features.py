@@ -116,30 +116,39 @@ def test_a_run_that_goes_on_does_not_detect_them_again(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one.xy_raw, again.xy_raw)
 
 
-def solution(num_photos):
-    """A result, or a solution, of so many photos."""
-    rec = SimpleNamespace(num_images=num_photos)
-    return SimpleNamespace(reconstruction=rec, shared=rec)
+def rotated(num_photos, radians):
+    """A solution of so many photos, which rotated by these angles."""
+    phi = np.zeros((num_photos, 3))
+    phi[:, 1] = radians
+    return SimpleNamespace(num_images=num_photos, phi=phi, frame_span=lambda: np.ones(num_photos))
+
+
+def by_affine_features(registered, num_found, total=6):
+    """How many photos the solution that is taken has; None if it is not that of affine features."""
+
+    def solve(mapped, track_source):
+        assert (mapped, track_source) == ("mapped", "source")
+        if num_found is None:
+            raise ReconstructionError("too few")
+        return SimpleNamespace(shared=SimpleNamespace(num_images=num_found))
+
+    source = SimpleNamespace(of_affine=lambda: ("mapped", "source"), matched=SimpleNamespace(names=[""] * total))
+    found = model_sequence._by_affine_features(source, registered, solve)
+    return None if found is None else found.shared.num_images
 
 
 def test_a_solution_by_them_is_taken_if_it_has_more_photos():
-    def chosen(registered, of_affine, total=6):
-        def solve(mapped, track_source):
-            assert (mapped, track_source) == ("mapped", "source")
-            if of_affine is None:
-                raise ReconstructionError("too few")
-            return solution(of_affine)
+    strong = rotated(4, 0.2)
+    assert by_affine_features(strong, 5) == 5
+    assert by_affine_features(strong, 4) is None
+    assert by_affine_features(strong, None) is None  # a mapping that fails changes nothing
+    source = SimpleNamespace(of_affine=None, matched=SimpleNamespace(names=["", "", "", "", ""]))
+    assert model_sequence._by_affine_features(source, strong, None) is None
 
-        source = SimpleNamespace(of_affine=lambda: ("mapped", "source"), matched=SimpleNamespace(names=[""] * total))
-        found = model_sequence._by_affine_features(source, solution(registered), solve)
-        return None if found is None else found.shared.num_images
 
-    assert chosen(4, 5) == 5
-    assert chosen(4, 4) is None
-    assert chosen(4, None) is None  # a mapping that fails changes nothing
-    assert chosen(6, 7) is None  # there is nothing to gain
-    source = SimpleNamespace(of_affine=None, matched=SimpleNamespace(names=["", ""]))
-    assert model_sequence._by_affine_features(source, solution(1), None) is None
+def test_nobody_pays_for_them_who_does_not_need_them():
+    assert by_affine_features(rotated(6, 0.2), 7) is None  # all photos are registered
+    assert by_affine_features(rotated(4, [0.02, 0.02, 0.03, 0.4]), 6) is None  # one was bumped
 
 
 def test_a_photo_that_is_gone_ends_the_run_in_one_line(tmp_path):

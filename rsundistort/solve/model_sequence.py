@@ -44,6 +44,7 @@ from .tracks import (
     adjusted_sequence,
     check_enough,
     is_strong,
+    most_are_strong,
     of_registered,
     retriangulated,
     rough_options,
@@ -182,7 +183,7 @@ def solve_tracks(
     if track_source is not None and registrar is not None:
         result, left_out = registrar.all_registered(result, again=survey is None)
         strong = strong or is_strong(result.reconstruction)
-        more = _by_affine_features(track_source, result, partial(solve, options_of=options_of)) if strong else None
+        more = _by_affine_features(track_source, result.reconstruction, partial(solve, options_of=options_of))
         if more is not None:
             return more
         warn_of_left_out(left_out)
@@ -214,10 +215,14 @@ def solve_tracks(
     return solved if survey is None else _on_the_map(solved, survey, options)
 
 
-def _by_affine_features(track_source: TrackSource, result: BundleResult, solve: Callable[..., Solved]) -> Solved | None:
-    """The solution of features that a strong shutter leaves as they are, if it has more photos than are registered."""
-    num_registered = result.reconstruction.num_images
-    if track_source.of_affine is None or num_registered == len(track_source.matched.names):
+def _by_affine_features(
+    track_source: TrackSource, registered: Reconstruction, solve: Callable[..., Solved]
+) -> Solved | None:
+    """The solution of features that strong shutters leave as they are, if it has photos that are not registered."""
+    num_registered = registered.num_images
+    if num_registered == len(track_source.matched.names) or track_source.of_affine is None:
+        return None
+    if not most_are_strong(registered):
         return None
     with suppress(ReconstructionError):
         mapped, source = track_source.of_affine()
