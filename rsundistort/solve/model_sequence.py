@@ -44,7 +44,6 @@ from .tracks import (
     adjusted_sequence,
     check_enough,
     is_strong,
-    most_are_strong,
     of_registered,
     retriangulated,
     rough_options,
@@ -53,6 +52,8 @@ from .tracks import (
 
 __all__ = ["solve_photos", "solve_tracks", "without_shutter"]
 
+# Share of the photos that are left out from which on features of all are detected once more.
+_WORTH = 0.1
 # Where a shutter was not found, the principal point without one is not farther than this share of the frame from that
 # with one, if both are the lens's: stabilised lenses move it by a few hundredths.
 _NO_LENS = 0.1
@@ -183,7 +184,7 @@ def solve_tracks(
     if track_source is not None and registrar is not None:
         result, left_out = registrar.all_registered(result, again=survey is None)
         strong = strong or is_strong(result.reconstruction)
-        more = _by_affine_features(track_source, result.reconstruction, partial(solve, options_of=options_of))
+        more = _by_affine_features(track_source, result, partial(solve, options_of=options_of)) if strong else None
         if more is not None:
             return more
         warn_of_left_out(left_out)
@@ -215,14 +216,10 @@ def solve_tracks(
     return solved if survey is None else _on_the_map(solved, survey, options)
 
 
-def _by_affine_features(
-    track_source: TrackSource, registered: Reconstruction, solve: Callable[..., Solved]
-) -> Solved | None:
+def _by_affine_features(track_source: TrackSource, result: BundleResult, solve: Callable[..., Solved]) -> Solved | None:
     """The solution of features that strong shutters leave as they are, if it has photos that are not registered."""
-    num_registered = registered.num_images
-    if num_registered == len(track_source.matched.names) or track_source.of_affine is None:
-        return None
-    if not most_are_strong(registered):
+    total, num_registered = len(track_source.matched.names), result.reconstruction.num_images
+    if track_source.of_affine is None or total - num_registered < max(_WORTH * total, 1):
         return None
     with suppress(ReconstructionError):
         mapped, source = track_source.of_affine()

@@ -16,7 +16,6 @@ from ..errors import ReconstructionError, RsUndistortWarning
 from ..input.load import LoadedPhotos
 from ..input.patches import patch_source
 from ..model import Reconstruction
-from ..model.array_types import Array
 from ..model.projection import unproject_points
 from ..sfm import MatchedPhotos, align_tracks, firmly_connected, retriangulate
 from .depth_reversal import choose_depths
@@ -27,7 +26,6 @@ __all__ = [
     "adjusted_sequence",
     "check_enough",
     "is_strong",
-    "most_are_strong",
     "of_registered",
     "retriangulated",
     "rough_options",
@@ -123,17 +121,7 @@ def rough_options(options: BundleOptions) -> BundleOptions:
 
 def is_strong(rec: Reconstruction) -> bool:
     """Whether photos rotated by so much that mapping may have given them wrong poses."""
-    return bool(_rotations(rec).max() > _STRONG_RAD)
-
-
-def most_are_strong(rec: Reconstruction) -> bool:
-    """Whether most photos rotated by so much that they are sheared against each other."""
-    return bool(np.median(_rotations(rec)) > _STRONG_RAD)
-
-
-def _rotations(rec: Reconstruction) -> Array:
-    """(m,) how far photos rotated during their readout, radians."""
-    return np.linalg.norm(rec.phi, axis=1) * rec.frame_span()
+    return bool((np.linalg.norm(rec.phi, axis=1) * rec.frame_span()).max() > _STRONG_RAD)
 
 
 def check_enough(registered: Reconstruction, total: int) -> None:
