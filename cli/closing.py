@@ -60,6 +60,7 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
 
 def closing_table(solution: Solution, out: Path) -> str:
     """Table of the result with one line per photo, in 80 columns."""
+    from rsundistort.input.load import UNCONNECTED
     from rsundistort.report import verdict_of
 
     rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]
@@ -107,6 +108,10 @@ def closing_table(solution: Solution, out: Path) -> str:
     lost = [image for image in solution.images if not image.registered]
     if lost:
         lines += ["", "not registered:", *(f"  {image.name}: {image.reason}" for image in lost)]
+        tried = any(stage["name"] == "affine features" for stage in solution.stages)
+        missing = any(image.reason == UNCONNECTED for image in lost)
+        if missing and solution.options.get("features") == "auto" and not tried:
+            lines += ["  features that take longer may register more: --features affine"]
     return "\n".join(part for line in lines for part in fitted(line))
 
 

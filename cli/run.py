@@ -75,6 +75,14 @@ _measure_options = opt.gathered(
         help="Size in megapixels at which features are detected. Larger photos are shrunk for it.",
     ),
     click.option(
+        "--features",
+        type=click.Choice(("auto", "affine")),
+        default="auto",
+        help="If photos are not registered, affine: detect features of the shape of their surroundings, too, which "
+        "photos share that look from sides further apart; they take nine times as long, and the solution with more "
+        "photos is kept. auto: only if a strong shutter may be why.",
+    ),
+    click.option(
         "--matching",
         type=click.Choice(opt.MATCHING_NAMES),
         default="auto",

@@ -14,7 +14,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "Video and gyroscope": (
         "frames", "every", "sharpest", "gyro", "gyro_offset", "gyro_axes", "photo_times", "readout_ms",
     ),
-    "Features and matching": ("max_features", "feature_megapixels", "matching", "database"),
+    "Features and matching": ("max_features", "feature_megapixels", "features", "matching", "database"),
     "Camera and motion": ("shutter_model", "refine", "camera_sigma", "still", "known", "remedy"),
     "Survey": ("crs", "control", "lengths"),
     "Rectified photos": (

@@ -96,9 +96,9 @@ def test_photos_get_them_and_are_verified_with_a_shutter(tmp_path, monkeypatch):
     monkeypatch.setattr(placing, "verify_with_shutter", lambda _, is_strong: verified.append(is_strong))
     monkeypatch.setattr(placing, "map_photos", take)
     other, log = loaded_views(tmp_path / "in", Kept())
-    for photos in (other.photos, other.affine()):
+    for photos, is_strong in ((other.photos, False), (other.affine(), True)):
         with pytest.raises(ReconstructionError):
-            placing.place_photos(photos, tmp_path, log, 0, "auto", Kept(), with_shutter=True)
+            placing.place_photos(photos, tmp_path, log, 0, "auto", Kept(), with_shutter=True, is_strong=is_strong)
     assert verified == [False, True]
     assert [each.step_px for each in mapped[1].features] == pytest.approx([2.63] * 3, abs=0.01)
     assert mapped[0].database != mapped[1].database
@@ -116,7 +116,7 @@ def test_a_run_that_goes_on_does_not_detect_them_again(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one.xy_raw, again.xy_raw)
 
 
-def by_affine_features(num_registered, num_found, total=6, *, can=True):
+def by_affine_features(num_registered, num_found, total=6, *, can=True, strong=True, always=False):
     """How many photos the solution that is taken has; None if it is not that of affine features."""
 
     def solve(mapped, track_source):
@@ -125,10 +125,15 @@ def by_affine_features(num_registered, num_found, total=6, *, can=True):
             raise ReconstructionError("too few")
         return SimpleNamespace(shared=SimpleNamespace(num_images=num_found))
 
-    of_affine = (lambda: ("mapped", "source")) if can else None
-    source = SimpleNamespace(of_affine=of_affine, matched=SimpleNamespace(names=[""] * total))
+    def of_affine(is_strong):
+        assert is_strong == strong
+        return "mapped", "source"
+
+    source = SimpleNamespace(
+        of_affine=of_affine if can else None, always_affine=always, matched=SimpleNamespace(names=[""] * total)
+    )
     result = SimpleNamespace(reconstruction=SimpleNamespace(num_images=num_registered))
-    found = model_sequence._by_affine_features(source, result, solve)
+    found = model_sequence._by_affine_features(source, result, solve, strong)
     return None if found is None else found.shared.num_images
 
 
@@ -143,6 +148,13 @@ def test_nobody_pays_for_them_who_hardly_needs_them():
     assert by_affine_features(6, 7) is None
     assert by_affine_features(91, 100, total=100) is None
     assert by_affine_features(90, 100, total=100) == 100
+    assert by_affine_features(4, 5, strong=False) is None
+
+
+def test_one_photo_is_reason_enough_where_that_is_wanted():
+    for strong in (False, True):
+        assert by_affine_features(99, 100, total=100, strong=strong, always=True) == 100
+        assert by_affine_features(100, 100, total=100, strong=strong, always=True) is None
 
 
 def test_a_photo_that_is_gone_ends_the_run_in_one_line(tmp_path):

@@ -433,12 +433,13 @@ def test_a_rolling_shutter_that_is_said_to_be_a_global_one_is_doubted(cut, tmp_p
         ({"still": {"walk-0001.png": 1e-4}}, "takes no --still, --known, --remedy or --model but global"),
         ({"remedy": "none"}, "takes no --still, --known, --remedy or --model but global"),
         ({"crs": "local"}, "frames of a video have no GPS"),
-        (GyroOptions("log.csv", times="times.csv"), "have times of their own; it takes no --photo-times"),
+        (RunOptions(gyro=GyroOptions("log.csv", times="times.csv")), "have times of their own; it takes no --photo-t"),
+        (RunOptions(features="affine"), "need no other features; leave --features out"),
     ],
 )
 def test_options_that_a_path_does_not_take_are_refused_before_the_video_is_read(cut, tmp_path, given, says):
-    stages, of_log = [], isinstance(given, GyroOptions)
-    options = RunOptions(gyro=given) if of_log else RunOptions(solve=SolveOptions(**given))
+    stages = []
+    options = given if isinstance(given, RunOptions) else RunOptions(solve=SolveOptions(**given))
     with pytest.raises(InputError, match=says):
         run(cut, tmp_path / "out", options, progress=lambda *told: stages.append(told))
     with pytest.raises(InputError, match=says):

@@ -105,6 +105,7 @@ MEASURE = [
     (["--gyro", "log.csv", "--photo-times", "t.csv"], {"gyro": GyroOptions(Path("log.csv"), times=Path("t.csv"))}),
     (["--max-features", "500"], {"max_features": 500}),
     (["--feature-megapixels", "2"], {"feature_megapixels": 2.0}),
+    (["--features", "affine"], {"features": "affine"}),
     (["--matching", "neighbours"], {"matching": "neighbours"}),
 ]
 # command, package and name of its function, required arguments

@@ -35,7 +35,7 @@ with errors_for_people(), progress_bars(Talk(verbose="-v" in sys.argv, quiet="-q
 """
 
 
-def solution(names, reason=None, advice=()):
+def solution(names, reason=None, advice=(), features="auto", stages=(), why="shares too little with the other photos"):
     camera = Camera(4000, 3000, [[3000, 0, 1999.5], [0, 3000, 1499.5], [0, 0, 1]], [0.01, -0.02, 0, 0])
     images = [
         SolvedImage(
@@ -44,7 +44,7 @@ def solution(names, reason=None, advice=()):
         )
         for i, name in enumerate(names)
     ]  # fmt: skip
-    images.append(SolvedImage("lost.jpg", "1", reason="shares too little with the other photos"))
+    images.append(SolvedImage("lost.jpg", "1", reason=why))
     return Solution(
         "constant-motion",
         {"1": camera},
@@ -71,8 +71,9 @@ def solution(names, reason=None, advice=()):
             "camera": "EXIF, refined",
             "readout": "top-to-bottom",
             "guesses": ["the direction of the readout is a guess of the size of the photos " * 2],
+            "features": features,
         },
-        stages=[{"name": "features", "seconds": 1.5}],
+        stages=[{"name": name, "seconds": 1.5} for name in ("features", *stages)],
     )
 
 
@@ -119,6 +120,20 @@ def test_closing_table_fits_80_columns():
     assert max(len(line) for line in text.splitlines()) <= 80
     for said in ("3 of 4", "constant-motion", "lost.jpg", "at the next shoot", "f 3000.0 +- 1.0"):
         assert said in text
+
+
+@pytest.mark.parametrize(
+    ("told", "says"),
+    [
+        ({}, True),
+        ({"features": "affine"}, False),
+        ({"features": None}, False),  # of a video, or a model
+        ({"stages": ["affine features"]}, False),
+        ({"why": "shows another scene"}, False),
+    ],
+)
+def test_other_features_are_named_where_they_may_register_photos(told, says):
+    assert ("--features affine" in closing_table(solution(["a.jpg"], **told), Path("out"))) == says
 
 
 def test_summary_says_what_the_table_says():

@@ -33,10 +33,12 @@ from ..sfm import (
 )
 from .photo_cameras import PhotoCameras, find_cameras
 
-__all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "OtherFeatures", "load_photos"]
+__all__ = ["LONG_EXPOSURE_S", "UNCONNECTED", "LoadedPhotos", "OtherFeatures", "load_photos"]
 
 #: Longer exposures bound the motion: a camera that rotated much would have blurred the photo.
 LONG_EXPOSURE_S = 1 / 250
+#: Why a photo is not registered of which nothing else is known.
+UNCONNECTED = "shares too little with the other photos"
 
 # Bytes per pixel of a decoded photo, at most, except for floats; and the size of one whose header has none.
 _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
@@ -96,7 +98,7 @@ class LoadedPhotos:
         self, registered: Sequence[str], num_verified: Mapping[tuple[int, int], int] | None = None
     ) -> dict[str, str]:
         """Photos that are not registered, and why; with the number of verified matches of each pair, if it is known."""
-        lost = dict.fromkeys(sorted({*self.names} - {*registered}), "shares too little with the other photos")
+        lost = dict.fromkeys(sorted({*self.names} - {*registered}), UNCONNECTED)
         for scene in other_scenes(num_verified or {}, np.isin(self.names, registered)):
             why = f"shows another scene, with {len(scene) - 1} other photos; put them in a folder of their own"
             lost |= dict.fromkeys((self.names[i] for i in scene), why)
@@ -288,7 +290,7 @@ class OtherFeatures:
             finer[name].features or old if name in finer else old
             for name, old in zip(photos.names, photos.features, strict=True)
         ]
-        return self._with(features, len(jobs), affine=False)
+        return self._with("features", features, len(jobs))
 
     def affine(self) -> LoadedPhotos:
         """Those of the shape of their surroundings, which a strong shutter shears: `sfm.affine_features`."""
@@ -298,7 +300,7 @@ class OtherFeatures:
         workers = self.workers
         if left and not workers.scheduler:
             workers = workers.fitting("features", max(map(_bytes_of, left)))
-        self.log.begin("features", len(jobs), len(found))
+        self.log.begin("affine features", len(jobs), len(found))
         results = workers.map(_reduce, left, lambda job, why: _Reduced(problem=f"{job.name}: {why}"))
         with closing(results):
             for start in range(0, len(left), _AT_ONCE * workers.jobs):
@@ -313,8 +315,8 @@ class OtherFeatures:
                     ):
                         found[job.name] = each
                         self.kept.put(key(job.name), each)
-                self.log.tell("features", len(found), len(jobs))
-        return self._with([found[job.name] for job in jobs], len(jobs), affine=True)
+                self.log.tell("affine features", len(found), len(jobs))
+        return self._with("affine features", [found[job.name] for job in jobs], len(jobs))
 
     def _jobs(self) -> list[_LoadJob]:
         photos = self.photos
@@ -324,9 +326,9 @@ class OtherFeatures:
             for name in photos.names
         ]
 
-    def _with(self, features: list[Features], num_photos: int, *, affine: bool) -> LoadedPhotos:
-        self.log.end("features", photos=num_photos, keypoints=sum(len(each.xy_raw) for each in features))
-        return replace(self.photos, features=features, coarse=frozenset(), affine=affine)
+    def _with(self, stage: str, features: list[Features], num_photos: int) -> LoadedPhotos:
+        self.log.end(stage, photos=num_photos, keypoints=sum(len(each.xy_raw) for each in features))
+        return replace(self.photos, features=features, coarse=frozenset(), affine=stage == "affine features")
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,8 @@ def solve_photos(
     kept: Kept | None = None,
     survey: Survey | None = None,
     other: OtherFeatures | None = None,
+    *,
+    always_affine: bool = False,
 ) -> Solved:
     """Match, map and adjust the model sequence; then remove the shutter from keypoints, make new tracks and adjust.
 
@@ -111,21 +113,26 @@ def solve_photos(
         Positions of photos and control points: the frame is then that of the map.
     other : OtherFeatures, optional
         Features that photos get whose own ones match too few of others.
+    always_affine : bool
+        Whether photos that are left out are reason enough for affine features, without a strong shutter.
     """
     place = partial(place_photos, log=log, seed=seed, matching=matching, kept=kept or Kept(), with_shutter=True)
 
     @cache
-    def of_affine() -> tuple[Reconstruction, TrackSource]:
+    def of_affine(is_strong: bool) -> tuple[Reconstruction, TrackSource]:
         assert other is not None
         folder = scratch / "affine"
         folder.mkdir()
-        mapped, matched = place(other.affine(), folder)
+        mapped, matched = place(other.affine(), folder, is_strong=is_strong)
         return mapped, TrackSource(matched, photos, workers, mapped_here=True)
 
     mapped, matched = place(photos, scratch, other=other)
     check_enough(mapped, len(photos.names))
     num_verified = read_num_verified(matched)
-    source = TrackSource(matched, photos, workers, mapped_here=True, of_affine=None if other is None else of_affine)
+    source = TrackSource(
+        matched, photos, workers, mapped_here=True,
+        of_affine=None if other is None else of_affine, always_affine=always_affine,
+    )  # fmt: skip
     solved = solve_tracks(mapped, photos.cameras, shutter_model, seed, options_of, log, remedy, source, survey)
     lost = photos.unregistered(solved.shared.image_names, num_verified)
     solved = replace(solved, unregistered=lost, camera_of=photos.camera_of)
@@ -184,7 +191,7 @@ def solve_tracks(
     if track_source is not None and registrar is not None:
         result, left_out = registrar.all_registered(result, again=survey is None)
         strong = strong or is_strong(result.reconstruction)
-        more = _by_affine_features(track_source, result, partial(solve, options_of=options_of)) if strong else None
+        more = _by_affine_features(track_source, result, partial(solve, options_of=options_of), strong)
         if more is not None:
             return more
         warn_of_left_out(left_out)
@@ -216,13 +223,16 @@ def solve_tracks(
     return solved if survey is None else _on_the_map(solved, survey, options)
 
 
-def _by_affine_features(track_source: TrackSource, result: BundleResult, solve: Callable[..., Solved]) -> Solved | None:
+def _by_affine_features(
+    track_source: TrackSource, result: BundleResult, solve: Callable[..., Solved], strong: bool
+) -> Solved | None:
     """The solution of features that strong shutters leave as they are, if it has photos that are not registered."""
     total, num_registered = len(track_source.matched.names), result.reconstruction.num_images
-    if track_source.of_affine is None or total - num_registered < max(_WORTH * total, 1):
+    least = 1 if track_source.always_affine else max(_WORTH * total, 1) if strong else np.inf
+    if track_source.of_affine is None or total - num_registered < least:
         return None
     with suppress(ReconstructionError):
-        mapped, source = track_source.of_affine()
+        mapped, source = track_source.of_affine(strong)
         solved = solve(mapped, track_source=source)
         if solved.shared.num_images > num_registered:
             return solved

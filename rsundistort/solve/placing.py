@@ -40,6 +40,7 @@ def place_photos(
     kept: Kept,
     *,
     with_shutter: bool = False,
+    is_strong: bool = False,
     of_clip: bool = False,
     other: OtherFeatures | None = None,
 ) -> tuple[Reconstruction, MatchedPhotos]:
@@ -53,6 +54,8 @@ def place_photos(
         As in `solve_photos`.
     with_shutter : bool
         Whether pairs that a shutter hides are verified by relative poses with a shutter.
+    is_strong : bool
+        Whether that is known to be a strong one.
     of_clip : bool
         Whether they are key frames of a video in its order, which differ by little.
     other : OtherFeatures, optional
@@ -60,7 +63,7 @@ def place_photos(
     """
     match = partial(
         _match, scratch=scratch, log=log, seed=seed, matching=matching, kept=kept, with_shutter=with_shutter,
-        of_clip=of_clip,
+        is_strong=is_strong, of_clip=of_clip,
     )  # fmt: skip
     # without finer ones, coarse features have to do
     matched = match(photos if other is not None else replace(photos, coarse=frozenset()))
@@ -96,6 +99,7 @@ def _match(
     kept: Kept,
     *,
     with_shutter: bool,
+    is_strong: bool,
     of_clip: bool,
 ) -> MatchedPhotos | None:
     """Photos matched with each other, as in `place_photos`; None if their features are too coarse for that."""
@@ -127,8 +131,7 @@ def _match(
             matched = start(pairs=pairs)
         counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
         if with_shutter:
-            # only photos that turned out to have a strong shutter get affine features
-            counts["spread_rad"] = verify_with_shutter(matched, is_strong=photos.affine)
+            counts["spread_rad"] = verify_with_shutter(matched, is_strong=is_strong)
         kept.put_file(f"database{detail}", database)
         kept.put(f"pairs{detail}", counts)
     log.end("matching", **counts)

@@ -84,7 +84,7 @@ def measure_readout(
     video = local_place(video)
     if not is_video(video):
         raise InputError(f"{video} is no video; a readout time is measured from one")
-    check_of_video(options.solve, options.gyro)
+    check_of_video(options)
     log, workers = StageLog(progress), Workers(use_threads(jobs))
     with work_folder() as work, warnings.catch_warnings():
         # no frame is rectified

@@ -94,7 +94,7 @@ def run(
     if options.frames == "all" and not is_clip:
         raise InputError(f"{photos} is no video; --frames all is for one")
     if is_clip:
-        check_of_video(options.solve, options.gyro)
+        check_of_video(options)
     of_video = [name for name in OF_VIDEOS if name != VIDEO or options.frames == "all"] if is_clip else []
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
     with run_folder(out, key_of(inputs, options), log, overwrite=overwrite, resume=resume) as before:
@@ -162,7 +162,8 @@ def _solved(
         solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log, kept)
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
-    facts = {
+    facts: dict[str, Any] = {} if is_clip else {"features": options.features}
+    facts |= {
         "max_features": options.most_features(is_clip),
         "feature_megapixels": options.feature_megapixels,
         "matching": options.matching,
@@ -215,6 +216,7 @@ def _solve(
         solved = solve_photos(
             loaded, solving.shutter_model, solving.seed, options_of,
             work, log, solving.remedy, options.matching, workers, kept, survey, other,
+            always_affine=options.features == "affine",
         )  # fmt: skip
     rec = solved.shared
     cameras.check_plausible(rec.cameras)
@@ -227,8 +229,13 @@ def _solve(
     return replace(solved, readouts=readouts), solving
 
 
-def check_of_video(solving: SolveOptions, gyro: GyroOptions | None) -> None:
+def check_of_video(options: RunOptions) -> None:
     """Refuse options that the path of a video does not take."""
+    solving, gyro = options.solve, options.gyro
+    if options.features != "auto":
+        raise InputError(
+            "frames of a video differ by little and need no other features; leave --features out, or say --every N"
+        )
     if solving.control or solving.crs not in (None, "none"):
         raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
     of_photos = solving.still or solving.known or solving.known_bends or solving.remedy != "auto"

@@ -26,9 +26,10 @@ from ..sfm import DETECTION_MEGAPIXELS
 
 __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
 
-
 #: Frames of a video that are rectified.
 FRAMES = ("key", "all")
+#: Features that photos are matched by.
+FEATURES = ("auto", "affine")
 
 # Largest numbers of features by default.
 _OF_PHOTO, _OF_KEY_FRAME = 8192, 2048
@@ -196,6 +197,10 @@ class RunOptions(_Part):
     feature_megapixels : float
         Larger photos are reduced to this size to detect their features; all to a third of their own pixels where what
         these show matches well enough.
+    features : {"auto", "affine"}
+        What is done if photos are left out. "affine": all get features of the shape of their surroundings
+        (`sfm.affine_features`), by which photos match that look from sides further apart; they take nine times as long,
+        and the solution with more photos counts. "auto": only if a strong shutter may be why.
     every, sharpest : int, optional
         For a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`; by default its frames
         share one path, and its key frames are the photos.
@@ -214,6 +219,7 @@ class RunOptions(_Part):
     camera: str | None = None
     max_features: int | None = None
     feature_megapixels: float = DETECTION_MEGAPIXELS
+    features: str = "auto"
     every: int | None = None
     sharpest: int | None = None
     frames: str = "key"
@@ -230,6 +236,8 @@ class RunOptions(_Part):
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
         if not 0.05 <= self.feature_megapixels < np.inf:
             raise InputError(f"feature_megapixels={self.feature_megapixels!r}, expected at least 0.05")
+        if self.features not in FEATURES:
+            raise InputError(f"features={self.features!r}, expected one of {', '.join(FEATURES)}")
         if self.frames not in FRAMES:
             raise InputError(f"frames={self.frames!r}, expected one of {', '.join(FRAMES)}")
         if self.frames == "all" and not (self.every is None and self.sharpest is None):

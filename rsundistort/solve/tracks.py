@@ -63,14 +63,18 @@ class TrackSource:
         Whether the photos were mapped by us, in an arbitrary frame, so that they may be mapped once more. The frame of
         a model that somebody gave is kept.
     of_affine : callable or None
-        Gives a mapping, and the source, of features that a strong shutter leaves as they are; None if there are none.
+        Gives a mapping, and the source, of features that a strong shutter leaves as they are, by whether there is one;
+        None if there are none.
+    always_affine : bool
+        Whether one photo that is left out is reason enough for these.
     """
 
     matched: MatchedPhotos
     photos: LoadedPhotos | None = None
     workers: Workers | None = None
     mapped_here: bool = False
-    of_affine: Callable[[], tuple[Reconstruction, TrackSource]] | None = None
+    of_affine: Callable[[bool], tuple[Reconstruction, TrackSource]] | None = None
+    always_affine: bool = False
 
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
         """The tracks of a reconstruction, aligned at full size."""
