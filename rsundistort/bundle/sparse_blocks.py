@@ -141,8 +141,7 @@ class SparseBlocks:
         kernels.fill_blocks(
             *self._layout, self.pattern.rows, self.pattern.cols, S, scale, self.free, self.rank, self.begin, data
         )  # fmt: skip
-        # rows have less and less work
-        with self.threads(), numba.parallel_chunksize(1):
+        with self.threads():
             positive = kernels.factor_blocks(*self._layout, data)
         return BlockFactor(self, data, scale) if positive else None
 
