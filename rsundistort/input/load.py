@@ -27,6 +27,7 @@ from ..sfm import (
     detect_features,
     detection_bytes,
     edge_width_px,
+    features_of_both,
     grey_8_bit,
     other_scenes,
     reduce_photo,
@@ -293,7 +294,7 @@ class OtherFeatures:
         return self._with("features", features, len(jobs))
 
     def affine(self) -> LoadedPhotos:
-        """Those of the shape of their surroundings, which a strong shutter shears: `sfm.affine_features`."""
+        """And those of the shape of their surroundings, which a strong shutter shears: `sfm.affine_features`."""
         jobs, key = self._jobs(), "affine features of {}".format
         found: dict[str, Features] = {job.name: old for job in jobs if (old := self.kept.get(key(job.name)))}
         left = [job for job in jobs if job.name not in found]
@@ -310,11 +311,11 @@ class OtherFeatures:
                     raise FileError(lost[0])
                 photos = [each.photo for each in reduced if each.photo is not None]
                 with work_folder() as work:
-                    for job, each in zip(
-                        some, detect_affine_features(photos, self.max_features, workers.jobs, work), strict=True
-                    ):
-                        found[job.name] = each
-                        self.kept.put(key(job.name), each)
+                    affine = detect_affine_features(photos, self.max_features, workers.jobs, work)
+                    for job, each, other in zip(some, reduced, affine, strict=True):
+                        assert each.features is not None
+                        found[job.name] = features_of_both(each.features, other)
+                        self.kept.put(key(job.name), found[job.name])
                 self.log.tell("affine features", len(found), len(jobs))
         return self._with("affine features", [found[job.name] for job in jobs], len(jobs))
 
@@ -333,9 +334,10 @@ class OtherFeatures:
 
 @dataclass(frozen=True)
 class _Reduced:
-    """A photo as features are detected in it, or only the problem with it."""
+    """A photo as features are detected in it, and its usual ones; or only the problem with it."""
 
     photo: ReducedPhoto | None = None
+    features: Features | None = None
     problem: str = ""
 
 
@@ -346,7 +348,8 @@ def _reduce(job: _LoadJob) -> _Reduced:
         return _Reduced(problem=str(error))
     height, width = photo.pixels.shape[:2]
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
-    return _Reduced(reduce_photo(photo.pixels, mask, job.megapixels))
+    usual = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
+    return _Reduced(reduce_photo(photo.pixels, mask, job.megapixels), usual)
 
 
 def _read(

@@ -13,6 +13,7 @@ from .features import (
     ReducedPhoto,
     detect_features,
     detection_bytes,
+    features_of_both,
     grey_8_bit,
     reduce_photo,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "detection_bytes",
     "edge_width_px",
     "estimate_focal_length",
+    "features_of_both",
     "firmly_connected",
     "global_descriptors",
     "grey_8_bit",

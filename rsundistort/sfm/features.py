@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.array_types import Array
+from ..model.array_types import Array, Index
 from ..model.brightness import white_level
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "detect_features",
     "detection_bytes",
     "features_of",
+    "features_of_both",
     "grey_8_bit",
     "reduce_photo",
     "size_of_sigma",
@@ -57,16 +58,25 @@ class Features:
         RootSIFT, scaled by 512 as COLMAP stores it.
     step_px : float
         Pixels of the stored photo per pixel of the image that the features were detected in: the unit of their errors.
+    kind : (n,) uint8 array, optional
+        Descriptors of different kinds are not compared; by default all are of the kind 0.
     """
 
     xy_raw: Array
     sigma: Array
     descriptors: NDArray[np.uint8]
     step_px: float = 1.0
+    kind: NDArray[np.uint8] | None = None
 
     def largest(self, count: int) -> Features:
         """The largest of them, of this number."""
-        return Features(self.xy_raw[:count], self.sigma[:count], self.descriptors[:count], self.step_px)
+        kind = None if self.kind is None else self.kind[:count]
+        return Features(self.xy_raw[:count], self.sigma[:count], self.descriptors[:count], self.step_px, kind)
+
+    def of_kind(self, kind: int) -> Index:
+        """Indices of those of a kind."""
+        kinds = np.zeros(len(self.xy_raw), np.uint8) if self.kind is None else self.kind
+        return np.flatnonzero(kinds == kind)
 
 
 @dataclass(frozen=True)
@@ -163,6 +173,19 @@ def features_of(reduced: ReducedPhoto, xy: Array, size: Array, descriptors: NDAr
     """Features at places (n, 2) of a reduced photo, integer centres, and of these diameters (n,) there."""
     step = np.array(reduced.size) / reduced.gray.shape[::-1]
     return Features(step * (xy + 0.5) - 0.5, reduced.step_px * size_sigma(size), descriptors, reduced.step_px)
+
+
+def features_of_both(one: Features, other: Features) -> Features:
+    """Features of two kinds, detected in the same photo at the same size."""
+    sigma = np.concatenate([one.sigma, other.sigma])
+    order = np.argsort(-sigma, kind="stable")
+    return Features(
+        np.concatenate([one.xy_raw, other.xy_raw])[order],
+        sigma[order],
+        np.concatenate([one.descriptors, other.descriptors])[order],
+        one.step_px,
+        np.repeat(np.array([0, 1], np.uint8), [len(one.sigma), len(other.sigma)])[order],
+    )
 
 
 def detection_bytes(width: int, height: int, megapixels: float = DETECTION_MEGAPIXELS) -> float:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
@@ -85,17 +86,30 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
     before = _matched_pairs(matched)
     asked = combinations(range(len(matched.names)), 2) if pairs is None else np.sort(pairs, axis=1).tolist()
     new = sorted({(first, second) for first, second in asked} - before)
-    descriptors = [each.descriptors for each in matched.features]
-    words = make_codebook(descriptors, matched.seed)
-    index_of = lru_cache(_INDICES)(lambda photo: DescriptorIndex.of(descriptors[photo], words))
+    kinds = [0] if all(each.kind is None for each in matched.features) else [0, 1]
+    matchers = [_matcher_of(matched, kind) for kind in kinds]
     with quiet_pycolmap().Database.open(matched.database) as db:
         for first, second in new:
-            db.write_matches(first + 1, second + 1, match_descriptors(index_of(first), index_of(second)))
+            db.write_matches(first + 1, second + 1, np.vstack([match(first, second) for match in matchers]))
     _verify(matched, new, min(within_px, close))
     if close < within_px:  # with room for the shutter where the geometry without it loses matches
         with quiet_pycolmap().Database.open(matched.database) as db:
             lossy = [pair for pair in new if _loses_matches(db, *pair, close, within_px)]
         _verify(matched, lossy, within_px)
+
+
+def _matcher_of(matched: MatchedPhotos, kind: int) -> Callable[[int, int], NDArray[np.uint32]]:
+    """What gives the matches (k, 2) of two photos among their features of a kind."""
+    which = [each.of_kind(kind) for each in matched.features]
+    descriptors = [each.descriptors[mine] for each, mine in zip(matched.features, which, strict=True)]
+    words = make_codebook(descriptors, matched.seed)
+    index_of = lru_cache(_INDICES)(lambda photo: DescriptorIndex.of(descriptors[photo], words))
+
+    def match(first: int, second: int) -> NDArray[np.uint32]:
+        one, other = match_descriptors(index_of(first), index_of(second)).T
+        return np.column_stack([which[first][one], which[second][other]]).astype(np.uint32)
+
+    return match
 
 
 def verify_loosely(matched: MatchedPhotos) -> None:
