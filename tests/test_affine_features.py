@@ -110,6 +110,11 @@ def test_a_run_that_goes_on_does_not_detect_them_again(tmp_path, monkeypatch):
     other, _ = loaded_views(tmp_path / "in", kept)
     first = other.affine()
     assert first.affine
+    for usual, each in zip(other.photos.features, first.features, strict=True):
+        # of the usual ones in all pixels, and as many others at most
+        assert 0 < len(each.of_kind(1)) <= 1000
+        assert len(each.of_kind(0)) <= 1000
+        assert len(usual.of_kind(1)) == 0
     monkeypatch.setattr("rsundistort.input.load.detect_affine_features", None)
     for one, again in zip(first.features, other.affine().features, strict=True):
         np.testing.assert_array_equal(one.descriptors, again.descriptors)

@@ -9,6 +9,7 @@ from sift_like import sift_like
 from rsundistort import Camera, RowMotion, project_points
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.sfm import Features, match_photos, matching, read_num_verified
+from rsundistort.sfm.features import features_of_both
 from rsundistort.sfm.matching import LOOSE_PX, verify_loosely
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
@@ -78,3 +79,35 @@ def test_pairs_are_verified_once_more_with_room_for_a_strong_shutter(pair):
     verify_loosely(matched)
     assert (direction_of(matched) != before).any()
     assert read_num_verified(matched)[0, 1] >= 0.95 * RIGHT
+
+
+def test_features_of_both_kinds_are_the_largest_first():
+    def features(sigma, value):
+        return Features(
+            np.full((len(sigma), 2), value), np.array(sigma), np.full((len(sigma), 128), value, np.uint8), 2.0
+        )
+
+    both = features_of_both(features([5.0, 1.0], 3), features([4.0, 1.0, 0.5], 7))
+    np.testing.assert_array_equal(both.sigma, [5.0, 4.0, 1.0, 1.0, 0.5])
+    np.testing.assert_array_equal(both.kind, [0, 1, 0, 1, 1])
+    np.testing.assert_array_equal(both.descriptors[:, 0], [3, 7, 3, 7, 7])
+    np.testing.assert_array_equal(both.xy_raw[:, 0], [3, 7, 3, 7, 7])
+    assert both.step_px == 2.0
+    np.testing.assert_array_equal(both.of_kind(1), [1, 3, 4])
+    np.testing.assert_array_equal(both.largest(3).of_kind(1), [1])
+    np.testing.assert_array_equal(features([5.0, 1.0], 3).of_kind(0), [0, 1])
+
+
+def test_descriptors_of_one_kind_are_compared(rng, tmp_path):
+    things = sift_like(rng.uniform(0, 90, (60, 128)))
+    xy, kind = rng.uniform(0, 800, (60, 2)), np.repeat(np.array([0, 1], np.uint8), 30)
+    # the second photo shows the last twenty as the other kind; and the first ten as both, which leaves them clear
+    second = Features(
+        np.vstack([xy, xy[:10]]), np.ones(70), np.vstack([things, things[:10]]),
+        kind=np.concatenate([kind[:40], 1 - kind[40:], np.ones(10, np.uint8)]),
+    )  # fmt: skip
+    first = Features(xy, np.ones(60), things, kind=kind)
+    matched = match_photos(tmp_path / "both.db", ["a.jpg", "b.jpg"], [first, second], [CAMERA], np.zeros(2, int))
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        found = {*map(tuple, np.asarray(db.read_matches(1, 2)).tolist())}
+    assert found == {(k, k) for k in range(40)}

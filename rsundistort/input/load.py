@@ -74,7 +74,7 @@ class LoadedPhotos:
     coarse : frozenset of str
         Photos whose features were detected in fewer pixels than allowed; see `OtherFeatures`.
     affine : bool
-        Whether features have the shape of their surroundings; see there, too.
+        Whether features of the shape of their surroundings are among them; see there, too.
     """
 
     names: list[str]
@@ -294,7 +294,10 @@ class OtherFeatures:
         return self._with("features", features, len(jobs))
 
     def affine(self) -> LoadedPhotos:
-        """And those of the shape of their surroundings, which a strong shutter shears: `sfm.affine_features`."""
+        """Those of all pixels, and those of the shape of their surroundings (`sfm.affine_features`), of all photos.
+
+        A strong shutter shears surroundings. Of leaves and grass the usual features match better.
+        """
         jobs, key = self._jobs(), "affine features of {}".format
         found: dict[str, Features] = {job.name: old for job in jobs if (old := self.kept.get(key(job.name)))}
         left = [job for job in jobs if job.name not in found]

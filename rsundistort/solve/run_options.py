@@ -198,7 +198,7 @@ class RunOptions(_Part):
         Larger photos are reduced to this size to detect their features; all to a third of their own pixels where what
         these show matches well enough.
     features : {"auto", "affine"}
-        What is done if photos are left out. "affine": all get features of the shape of their surroundings
+        What is done if photos are left out. "affine": all get features of the shape of their surroundings, too
         (`sfm.affine_features`), by which photos match that look from sides further apart; they take nine times as long,
         and the solution with more photos counts. "auto": only if a strong shutter may be why.
     every, sharpest : int, optional
