@@ -78,9 +78,9 @@ _measure_options = opt.gathered(
         "--features",
         type=click.Choice(("auto", "affine")),
         default="auto",
-        help="If photos are not registered, affine: detect features of the shape of their surroundings, too, which "
-        "photos share that look from sides further apart; they take nine times as long, and the solution with more "
-        "photos is kept. auto: only if a strong shutter may be why.",
+        help="If photos are not registered, affine: also detect features of the shape of their surroundings, "
+        "which match between photos from sides further apart, and keep the solution with more photos; they take nine "
+        "times as long. auto: do so only if a strong shutter may be why.",
     ),
     click.option(
         "--matching",

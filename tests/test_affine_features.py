@@ -156,10 +156,17 @@ def test_nobody_pays_for_them_who_hardly_needs_them():
     assert by_affine_features(4, 5, strong=False) is None
 
 
-def test_one_photo_is_reason_enough_where_that_is_wanted():
+def test_one_photo_is_reason_enough_where_that_is_wanted(monkeypatch):
+    monkeypatch.setattr(model_sequence, "consistent", lambda *_: True)
     for strong in (False, True):
         assert by_affine_features(99, 100, total=100, strong=strong, always=True) == 100
         assert by_affine_features(100, 100, total=100, strong=strong, always=True) is None
+
+
+def test_places_without_a_strong_shutter_must_stay(monkeypatch):
+    monkeypatch.setattr(model_sequence, "consistent", lambda *_: False)
+    assert by_affine_features(4, 5, strong=False, always=True) is None
+    assert by_affine_features(4, 5, strong=True, always=True) == 5
 
 
 def test_a_photo_that_is_gone_ends_the_run_in_one_line(tmp_path):

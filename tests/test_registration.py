@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, bundle_adjust
+from rsundistort.model.similarity import Similarity
 from rsundistort.sfm import map_photos, map_without_motions, read_num_verified, register_photos
 from rsundistort.sfm.contradiction import contradicting_photos, parts_that_agree
 from rsundistort.sfm.epipolar import agreeing_photos, read_matches
@@ -22,7 +23,7 @@ from rsundistort.sfm.sides import carried_along
 from rsundistort.sfm.verification import pair_of
 from rsundistort.solve import registering
 from rsundistort.solve.registering import Registrar
-from rsundistort.solve.solutions import agree, num_explained, photos_apart
+from rsundistort.solve.solutions import agree, consistent, num_explained, photos_apart
 from rsundistort.solve.tracks import TrackSource, rough_options
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
@@ -356,3 +357,18 @@ def test_solutions_agree_in_any_frame_and_on_the_photos_of_both(scene):
     assert not agree(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))
     names = [*NAMES[:2], "other.jpg", *NAMES[3:]]
     assert agree(scene, replace(scene, R_cw=off, image_names=names))
+
+
+def test_solutions_are_consistent_in_any_frame_and_scale_but_not_with_a_side_of_another_scale(scene):
+    frame = Similarity(3.0, Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), np.array([5.0, -2.0, 1.0]))
+    assert consistent(scene, frame.of_reconstruction(scene))
+    assert consistent(scene.take_photos(np.arange(6) < 5), frame.of_reconstruction(scene))
+    # the photos of the side look where they should
+    center_w = scene.center_w.copy()
+    center_w[4:] = center_w[3] + 3.0 * (center_w[4:] - center_w[3])
+    assert agree(scene, replace(scene, center_w=center_w))
+    assert not consistent(scene, frame.of_reconstruction(replace(scene, center_w=center_w)))
+    off = scene.R_cw.copy()
+    off[2] = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix() @ off[2]
+    assert not consistent(scene, replace(scene, R_cw=off))
+    assert not consistent(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))

@@ -38,6 +38,7 @@ from ..verdict import Verdict, judge
 from .outcome import Solved
 from .placing import place_photos
 from .registering import Registrar, warn_of_left_out
+from .solutions import consistent
 from .survey import Survey
 from .tracks import (
     TrackSource,
@@ -226,7 +227,11 @@ def solve_tracks(
 def _by_affine_features(
     track_source: TrackSource, result: BundleResult, solve: Callable[..., Solved], strong: bool
 ) -> Solved | None:
-    """The solution of features that strong shutters leave as they are, if it has photos that are not registered."""
+    """The solution of features that strong shutters leave as they are, if it has photos that are not registered.
+
+    Without a strong shutter nothing speaks against the places that photos have, and those of the other must be the
+    same: a photo that few points connect may scale a part of the scene.
+    """
     total, num_registered = len(track_source.matched.names), result.reconstruction.num_images
     least = 1 if track_source.always_affine else max(_WORTH * total, 1) if strong else np.inf
     if track_source.of_affine is None or total - num_registered < least:
@@ -234,7 +239,7 @@ def _by_affine_features(
     with suppress(ReconstructionError):
         mapped, source = track_source.of_affine(strong)
         solved = solve(mapped, track_source=source)
-        if solved.shared.num_images > num_registered:
+        if solved.shared.num_images > num_registered and (strong or consistent(result.reconstruction, solved.shared)):
             return solved
     return None
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
+from ..model.similarity import similarity_of
 from ..sfm import SIFT_PX
 
-__all__ = ["agree", "num_explained", "photos_apart", "same_places"]
+__all__ = ["agree", "consistent", "num_explained", "photos_apart", "same_places"]
 
 # Of the noise of features: farther from its prediction no measurement is explained.
 _MOST_SIGMAS = 3.0
@@ -35,6 +36,16 @@ def num_explained(reconstruction: Reconstruction, without: Collection[str] = ())
 def agree(rec: Reconstruction, other: Reconstruction) -> bool:
     """Whether photos of two solutions, of which they share some, look the same ways."""
     return not {*rec.image_names}.isdisjoint(other.image_names) and not photos_apart(rec, other)
+
+
+def consistent(rec: Reconstruction, other: Reconstruction) -> bool:
+    """Whether photos of both solutions look the same ways and are in the same places, whatever their frames."""
+    both = [name for name in rec.image_names if name in other.image_names]
+    if not both:
+        return False
+    places, targets = (each.center_w[[each.image_names.index(name) for name in both]] for each in (other, rec))
+    moved = similarity_of(places, targets).of_reconstruction(other)
+    return agree(rec, moved) and same_places(rec, moved)
 
 
 def photos_apart(rec: Reconstruction, other: Reconstruction) -> list[str]:
