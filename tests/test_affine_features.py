@@ -1,5 +1,6 @@
 """Features of the shape of their surroundings, which photos with a strong shutter get."""
 
+import warnings
 from importlib import import_module
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from plane_photos import CAMERA, texture, views, write
 
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
-from rsundistort.errors import FileError, ReconstructionError
+from rsundistort.errors import FileError, ReconstructionError, RsUndistortWarning
 from rsundistort.input.load import OtherFeatures, load_photos
 from rsundistort.io.kept import Kept
 from rsundistort.sfm import detect_affine_features, detect_features, reduce_photo
@@ -126,6 +127,7 @@ def by_affine_features(num_registered, num_found, total=6, *, can=True, strong=T
 
     def solve(mapped, track_source):
         assert (mapped, track_source) == ("mapped", "source")
+        warnings.warn("it is so", RsUndistortWarning, stacklevel=2)
         if num_found is None:
             raise ReconstructionError("too few")
         return SimpleNamespace(shared=SimpleNamespace(num_images=num_found))
@@ -138,7 +140,11 @@ def by_affine_features(num_registered, num_found, total=6, *, can=True, strong=T
         of_affine=of_affine if can else None, always_affine=always, matched=SimpleNamespace(names=[""] * total)
     )
     result = SimpleNamespace(reconstruction=SimpleNamespace(num_images=num_registered))
-    found = model_sequence._by_affine_features(source, result, solve, strong)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = model_sequence._by_affine_features(source, result, solve, strong)
+    # of a solution that is not taken nothing is said
+    assert [str(each.message) for each in said] == ["it is so"] * (found is not None)
     return None if found is None else found.shared.num_images
 
 

@@ -233,15 +233,21 @@ def _by_affine_features(
     same: a photo that few points connect may scale a part of the scene.
     """
     total, num_registered = len(track_source.matched.names), result.reconstruction.num_images
+    solved: Solved | None = None
     least = 1 if track_source.always_affine else max(_WORTH * total, 1) if strong else np.inf
     if track_source.of_affine is None or total - num_registered < least:
         return None
-    with suppress(ReconstructionError):
+    # what is said of a solution that is not taken concerns nobody
+    with suppress(ReconstructionError), warnings.catch_warnings(record=True) as said:
         mapped, source = track_source.of_affine(strong)
         solved = solve(mapped, track_source=source)
-        if solved.shared.num_images > num_registered and (strong or consistent(result.reconstruction, solved.shared)):
-            return solved
-    return None
+    if solved is None or solved.shared.num_images <= num_registered:
+        return None
+    if not (strong or consistent(result.reconstruction, solved.shared)):
+        return None
+    for each in said:
+        warnings.warn(each.message, each.category, stacklevel=4)
+    return solved
 
 
 def _healed(
