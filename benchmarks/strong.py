@@ -8,8 +8,9 @@ Prints one JSON object a line and at the end a table. Parts:
 
     sets      herz-jesus-8 and dslr warped by --rad (0.10, 0.15, 0.20, 0.30) radians a frame (standard deviation of
               each component of phi): photos registered, those that are wrong by more than 1 degree against the photos
-              as they are, errors of the rotations, dB against references with the lens found. A warp whose rows
-              fold over is no photo that a camera can take: its seed is passed over, and said
+              as they are, errors of the rotations, and of the places over their extent, dB against references with the
+              lens found. A warp whose rows fold over is no photo that a camera can take: its seed is passed over, and
+              said
     pairs     relative poses of all pairs of the same warps, and of the photos as they are: area under the curve of the
               larger of the errors of rotation and direction up to 5 degrees, on the same matches, of five points
               (OpenCV's USAC, 4 px), of pycolmap, and ours
@@ -61,6 +62,7 @@ from rsundistort.errors import InputError
 from rsundistort.evaluation import psnr
 from rsundistort.input.load import LoadedPhotos, load_photos
 from rsundistort.io import read_photo
+from rsundistort.model.similarity import fit_similarity
 from rsundistort.sfm import (
     MatchedPhotos,
     firmly_connected,
@@ -105,6 +107,17 @@ def rotations_off(R_cw: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np
         off = (steps * common.inv()).magnitude()
         common = steps.mean(1.0 / np.maximum(off, 1e-4))
     return np.degrees((steps * common.inv()).magnitude())
+
+
+def places_off(solution: rs.Solution, still: rs.Solution) -> dict[str, float]:
+    """How far each photo is from its place, over the extent of all places, after the similarity that most agree on."""
+    truth = {image.name: image.center_w for image in still.registered}
+    images = [image for image in solution.registered if image.name in truth]
+    found, true = (np.array(each) for each in zip(*((i.center_w, truth[i.name]) for i in images), strict=True))
+    extent = float(np.linalg.norm(np.ptp(true, axis=0)))
+    moved = fit_similarity(found, true, np.full(true.shape, 1e-3 * extent)).similarity.of(found)
+    off = np.linalg.norm(moved - true, axis=1) / extent
+    return dict(zip([image.name for image in images], off.tolist(), strict=True))
 
 
 class Bench:
@@ -163,11 +176,13 @@ class Bench:
         named = {image.name for image in solution.images if image.doubtful or image.lens_only}
         wrong = sorted(photo for photo, error in errors.items() if error > WRONG_DEG)
         right, values = len(errors) - len(wrong), [*errors.values()]
+        places = [*places_off(solution, still).values()]
         show(
             f"{name} by {radians}, seed {seed}", registered=len(solution.registered), photos=len(solution.images),
             of_still=len(still.registered), right=right, wrong={photo: round(errors[photo], 2) for photo in wrong},
             wrong_and_not_named=sorted({*wrong} - named), median_deg=round(float(np.median(values)), 4),
-            max_deg=round(max(values), 4), **dB, model=solution.quality["held_out_chosen"],
+            max_deg=round(max(values), 4), median_place=round(float(np.median(places)), 4),
+            worst_place=round(max(places), 4), **dB, model=solution.quality["held_out_chosen"],
             verdict=[solution.verdict["shutter"], solution.verdict["shape"]], seconds=round(seconds, 1),
         )  # fmt: skip
         self.rows.append((
