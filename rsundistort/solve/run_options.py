@@ -28,7 +28,7 @@ __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
 
 #: Frames of a video that are rectified.
 FRAMES = ("key", "all")
-#: Features that photos are matched by.
+#: When photos that are left out get affine features: if a strong shutter may be why, or always.
 FEATURES = ("auto", "affine")
 
 # Largest numbers of features by default.
