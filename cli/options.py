@@ -195,8 +195,8 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
     click.option(
         "--scale",
         type=click.FloatRange(min=0, min_open=True),
-        default=1.0,
-        help="Size of the rectified photos relative to the raw ones. Photos that shrink are averaged.",
+        help="Size of the rectified photos relative to the raw ones. Photos that shrink are averaged. The default is "
+        "that of the solution, 1 for a new one.",
     ),
     click.option(
         "--max-size",

@@ -73,7 +73,7 @@ BLACK = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     [
         (only_sound, "holds no pictures"),
         (only_a_cover, "holds no pictures"),
-        (lambda path: encode(path, [view(0)]), "1 frame that shows anything; a path needs two"),
+        (lambda path: encode(path, [view(0)]), "only one frame that shows anything new; a path needs two"),
         (lambda path: encode(path, [BLACK] * 6), "no frame that shows anything; a path needs two"),
         (lambda path: path.write_bytes(b"no video\n" * 99), "cannot be read as a video"),
         (lambda path: path.write_bytes(b""), "cannot be read as a video"),

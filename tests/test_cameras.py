@@ -437,7 +437,9 @@ def test_a_camera_of_another_size_is_refused_with_what_to_do():
     assert "that is" not in fit_error(camera, 320, 241)
     text = fit_error(camera, 480, 640)
     assert "portrait" in text
-    assert "left-to-right" in text
+    # K is (500.1, 1530 / 3.1, 322.7, 235.25), of 640x480: rotated either way
+    assert "cx 235.25, cy 316.3 and the readout left-to-right" in text
+    assert "cx 243.75, cy 322.7 and the readout right-to-left" in text
     assert "landscape" in fit_error(replace(camera, width=480, height=640), 640, 480)
 
 
@@ -583,3 +585,11 @@ def test_calibrations_keep_every_digit(tmp_path_factory, focal, aspect, dist, wi
     assert read_one(folder / "digits.xml") == camera
     (folder / "digits.yaml").write_text(ros_text(camera), encoding="utf-8")
     assert read_one(folder / "digits.yaml") == camera
+
+
+def test_an_object_for_a_list_is_named(tmp_path):
+    path = tmp_path / "camera.json"
+    camera = {"width": 640, "height": 480, "K": K.tolist(), "dist": {"k1": 0.1}, "readout": "top-to-bottom"}
+    path.write_text(json.dumps(camera))
+    with pytest.raises(FormatError, match="dist is an object, expected a list of numbers"):
+        read_camera_file(path, 640, 480)

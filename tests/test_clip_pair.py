@@ -49,6 +49,14 @@ def test_points_are_followed_through_any_roll(tmp_path, roll_deg):
     assert np.mean(off < 1.0) > 0.98
 
 
+def test_two_frames_from_one_place_are_named(tmp_path):
+    H = K @ Rotation.from_rotvec([0.01, -0.02, 0.0]).as_matrix() @ np.linalg.inv(K)
+    frame = texture(WIDTH, HEIGHT, 3)
+    pair = pair_of(tmp_path, [frame, cv2.warpPerspective(frame, H, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)])
+    with pytest.raises(ReconstructionError, match=r"show the scene from one place.*takes three frames"):
+        pair.placed()
+
+
 def test_frames_that_share_nothing_are_named(tmp_path):
     with pytest.raises(ReconstructionError, match=r"clip_000000\.png and clip_000001\.png share too little"):
         pair_of(tmp_path, [texture(WIDTH, HEIGHT, seed) for seed in (1, 2)]).placed()

@@ -17,6 +17,7 @@ from rsundistort import (
     read_solution,
     rectify,
 )
+from rsundistort.io.record import Record
 
 
 def test_rectify(invoke, tmp_path):
@@ -262,3 +263,48 @@ def test_rectify_refuses_bad_folders(invoke, tmp_path):
     for photos, out in (("empty", "out"), ("none", "out"), ("photos", "photos"), ("photos", "s.json")):
         error_line(invoke("rectify", photos, "--solution", "s.json", "-o", out))
         assert tree(tmp_path) == before
+
+
+def test_scales_are_of_the_raw_photos(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    solution_of(tmp_path / "s.json", THREE)
+    args = ["rectify", "photos", "-q", "-o", "out", "--overwrite", "--solution"]
+
+    def size():
+        camera = read_solution(tmp_path / "out" / "solution.json").rectified_cameras["1"]
+        return camera.width, camera.height
+
+    assert invoke(*args, "s.json", "--scale", "0.5").exit_code == 0
+    half = tree(tmp_path / "out" / "images")
+    assert size() == (160, 120)
+    # the solution has that view now
+    for scale in ("--scale", "0.5"), ():
+        assert invoke(*args, "out/solution.json", *scale).exit_code == 0
+        assert tree(tmp_path / "out" / "images") == half
+    assert invoke(*args, "out/solution.json", "--max-size", "80").exit_code == 0
+    assert size() == (80, 60)
+    assert invoke(*args, "out/solution.json", "--scale", "1").exit_code == 0
+    assert size() == (320, 240)
+    result = invoke(*args, "s.json", "--scale", "200")
+    assert result.exit_code == 1
+    assert "scale=200 makes 64000x48000 pixels of 320x240" in result.stderr
+
+
+def test_models_of_a_run_describe_the_photos_beside_them(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    solution_of(tmp_path / "s.json", THREE)
+    args = ["rectify", "photos", "-q", "-o", "out", "--overwrite", "--solution"]
+    assert invoke(*args, "s.json").exit_code == 0
+    with Record(tmp_path / "out").writing(["transforms.json"]):
+        (tmp_path / "out" / "transforms.json").write_text("{}")
+    before = tree(tmp_path / "out")
+    # the same view again is what they describe
+    assert invoke(*args, "out/solution.json").exit_code == 0
+    others = [["out/solution.json", "--alpha", "0"], ["out/solution.json", "--apply-orientation"], ["s.json"]]
+    for other in others:
+        result = invoke(*args, *other)
+        assert result.exit_code == 1
+        assert "out holds transforms.json, which describes the photos that were rectified there" in result.stderr
+        assert tree(tmp_path / "out").keys() == before.keys()
+    (tmp_path / "photos" / "a.png").unlink()
+    assert invoke(*args, "out/solution.json").exit_code == 1

@@ -277,3 +277,14 @@ def test_truncated_photos_with_the_installed_command(tmp_path):
         "d.png",
     ]
     assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_used_is_refused_before_any_work(tmp_path, invoke):
+    save_textures(tmp_path / "photos", THREE)
+    (tmp_path / "others").mkdir()
+    for option, what in (("--also", "image"), ("--depth", "depth map")):
+        line = error_line(invoke("run", "photos", "-o", "out", "--camera", CAMERA, *FEW, option, "others"))
+        assert f"holds no {what} of any photo" in line
+    line = error_line(invoke("run", "photos", "-o", "out", "--camera", CAMERA, *FEW, "--scale", "300"))
+    assert "scale=300 makes" in line
+    assert not (tmp_path / "out").exists()

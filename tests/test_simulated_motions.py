@@ -195,7 +195,7 @@ def test_rotations_of_a_log_compose_as_rotations_do(rng):
 
 def test_logs_that_are_too_short_or_of_unknown_readout_are_refused():
     log = GyroLog(np.arange(0, 0.1, 0.01), np.zeros((10, 3)))
-    with pytest.raises(InputError, match="how long"):
+    with pytest.raises(InputError, match="how long a frame is read; give --readout-ms"):
         tracks(log, [CAMERA], None, 0)
     with pytest.raises(InputError, match=r"no stretch of 0\.2 s"):
         tracks(log, [CAMERA], 0.2, 0)

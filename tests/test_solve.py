@@ -526,3 +526,11 @@ def test_photos_missing_on_disk_are_named(tmp_path, rng):
     with pytest.raises(InputError, match=NAMES[0]):
         rs.solve(save(make_scene(rng).model, tmp_path / "model"), tmp_path / "out", OPTIONS, images=photos)
     assert not (tmp_path / "out").exists()
+
+
+def test_photos_that_were_rectified_before_are_refused(tmp_path, rng):
+    photos, model = save_photos(tmp_path / "photos", NAMES), save(make_scene(rng).model, tmp_path / "model")
+    rs.solve(model, tmp_path / "first", OPTIONS, images=photos)
+    with pytest.raises(InputError, match=r"all photos were rectified already, by rsundistort .*; give the raw ones"):
+        rs.solve(model, tmp_path / "out", OPTIONS, images=tmp_path / "first" / "images")
+    assert not (tmp_path / "out").exists()

@@ -27,6 +27,9 @@ from .workers import Workers, use_threads
 
 __all__ = ["photos_of", "rectify_folder"]
 
+# What a run writes that describes its rectified photos to other programs.
+_MODELS = ("sparse", "transforms.json")
+
 
 def rectify_folder(
     photos: Path | str,
@@ -96,6 +99,7 @@ def rectify_folder(
         record = Record(target)
         # a solution of ours is brought up to date in its place
         record.check(["solution.json"], [] if _is_of(solution, target) else [solution], again=resume)
+        _check_models(target, record, solution, solved, names, options)
         done = rectify_photos(
             folder, scene, names, target, options, workers, StageLog(progress), journal,
             posed=False, resume=resume,
@@ -139,6 +143,34 @@ def _as_rectified(solved: Solution, done: Mapping[str, PhotoDone], options: Rect
         orientations = {name: each.orientation for name, each in done.items() if not each.problem}
         solved = orient_solution(_without_mirrored_poses(solved, orientations), orientations)
     return solved
+
+
+def _check_models(
+    target: Place, record: Record, solution: Path, solved: Solution, names: list[str], options: RectifyOptions
+) -> None:
+    """Refuse a folder whose models for other programs describe other rectified photos than these will be."""
+    models = record.ours(_MODELS)
+    if not models or not isinstance(target, Path) or not (target / "solution.json").is_file():
+        return
+    former = read_solution(target / "solution.json")
+    were_rotated = any(image.applied_orientation != 1 for image in former.registered)
+    were_raw_as = former.options.get("raw_as") or options.raw_as
+    stored = in_stored_frame(former)
+    is_same = (
+        _is_of(solution, target)
+        and (options.apply_orientation, options.raw_as) == (were_rotated, were_raw_as)
+        and all(
+            image.name in names
+            and stored.rectified_cameras[image.camera_id] == solved.rectified_cameras[image.camera_id]
+            for image in stored.registered
+            if image.reason is None
+        )
+    )
+    if not is_same:
+        raise InputError(
+            f"{target} holds {min(models)}, which describes the photos that were rectified there; give another folder "
+            "for others, or repeat the run with these options"
+        )
 
 
 def _is_of(solution: Path, target: Place) -> bool:

@@ -225,8 +225,8 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             f"{video.name}: {num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=3
         )
     if len(numbers) < 2:
-        some = "1 frame that shows" if numbers else "no frame that shows"
-        raise InputError(f"{video.name} has {some} anything; a path needs two")
+        some = "only one frame that shows anything new" if numbers else "no frame that shows anything"
+        raise InputError(f"{video.name} has {some}; a path needs two")
     time = _with_repeated(video, np.array(numbers), np.array(times), len(repeated))
     frame_s = usual_step(time)
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}

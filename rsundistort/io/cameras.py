@@ -12,7 +12,8 @@ import numpy as np
 
 from ..colmap import read_colmap_cameras
 from ..errors import FileError, FormatError, InputError, file_errors, format_errors
-from ..model import Camera, other_axis
+from ..model import Camera
+from ..model.orientation import orient_camera
 from .calibrations import camera_from_calibration, has_size, is_calibration, kalibr_cameras, parse_xml, parse_yaml
 from .json_text import parse_json
 
@@ -42,6 +43,8 @@ def camera_from_json(value: Any, where: str) -> Camera:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
         raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens, field, sigma")
     given = {key: each for key, each in value.items() if key != "sigma"}
+    if objects := [key for key in ("K", "dist", "field") if isinstance(value.get(key), dict)]:
+        raise FormatError(f"{where}: {objects[0]} is an object, expected a list of numbers")
     with format_errors(where, (TypeError, ValueError, OverflowError)):
         arrays = {key: np.asarray(value.get(key) or [], float) for key in ("dist", "field")}
         return Camera(**{**given, **arrays})
@@ -165,9 +168,11 @@ def _how_to_fit(camera: Camera, width: int, height: int) -> str:
     """What to do about a camera of another size."""
     if (camera.width, camera.height) == (height, width):
         stored = "portrait" if height > width else "landscape"
+        ways = [orient_camera(camera, orientation) for orientation in (8, 6)]
+        here = " or ".join(f"cx {each.K[0, 2]:g}, cy {each.K[1, 2]:g} and the readout {each.readout}" for each in ways)
         return (
             f"they are stored in {stored}, rotated since they were read out: give a camera with width and height, fx "
-            f"and fy, cx and cy exchanged and the readout {other_axis(camera.readout)}"
+            f"and fy exchanged, and {here}, by the way that they were rotated"
         )
     factor = Fraction(width, camera.width)
     if factor == Fraction(height, camera.height):

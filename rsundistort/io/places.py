@@ -171,8 +171,9 @@ def place_of(place: Place | str) -> Place:
     Raises
     ------
     InputError
-        When no file system is known for the URL, or its package is missing.
+        When it is neither a path nor a URL, no file system is known for the URL, or its package is missing.
     """
+    _check_is_place(place)
     if isinstance(place, str) and place.startswith(("file://", "local://")):
         place = Path(url2pathname(place.partition("://")[2]))
     if isinstance(place, str) and "://" in place:
@@ -185,6 +186,7 @@ def place_of(place: Place | str) -> Place:
 
 def local_place(place: Path | str) -> Path:
     """A path as it is, that of a file:// URL; other URLs are refused."""
+    _check_is_place(place)
     if isinstance(place, Path):
         return place
     if "://" not in place:
@@ -196,6 +198,11 @@ def local_place(place: Path | str) -> Path:
     local = place_of(place)
     assert isinstance(local, Path)
     return local
+
+
+def _check_is_place(place: object) -> None:
+    if not isinstance(place, str | os.PathLike | RemoteFolder):
+        raise InputError(f"a path or URL is needed, not {place!r:.60}")
 
 
 def files_in(place: Place, within: str = ".") -> dict[str, File] | None:

@@ -208,8 +208,17 @@ def orient_solution(solution: Solution, orientations: Mapping[str, int]) -> Solu
 
 
 def in_stored_frame(solution: Solution) -> Solution:
-    """The solution of the photos as the sensor stored them, of one whose photos may have been rotated."""
-    return orient_solution(solution, {image.name: INVERSE[image.applied_orientation] for image in solution.images})
+    """The solution of the photos as the sensor stored them, of one whose photos may have been rotated.
+
+    Cameras that no photo has are left out.
+    """
+    stored = orient_solution(solution, {image.name: INVERSE[image.applied_orientation] for image in solution.images})
+    used = {image.camera_id for image in stored.images}
+    cameras, rectified = (
+        {key: camera for key, camera in each.items() if key in used}
+        for each in (stored.cameras, stored.rectified_cameras)
+    )
+    return replace(stored, cameras=cameras, rectified_cameras=rectified)
 
 
 def orient_reconstruction(reconstruction: Reconstruction, orientations: Mapping[str, int]) -> Reconstruction:

@@ -12,6 +12,7 @@ from ..model import Camera, RowMotion
 from ..model.array_types import Array
 from ..model.checks import check_fields, check_number, check_size
 from ..model.projection import motion_of, unproject_points
+from .photo import MAX_SIDE
 
 __all__ = ["ViewOptions", "optimal_new_camera", "rectified_roi", "rectified_view", "steadiest_pinhole"]
 
@@ -32,14 +33,14 @@ class ViewOptions:
     alpha : float or "keep", optional
         0: no empty pixel in any photo of a camera; 1: every pixel of all of them; between: between, as in
         `optimal_new_camera`. "keep": K and size of the raw photos. None: as the solution has it, "keep" for a new one.
-    scale : float
-        Size of the rectified photos in that of the raw ones.
+    scale : float, optional
+        Size of the rectified photos in that of the raw ones. None: as the solution has it, 1 for a new view.
     max_size : int, optional
         Longest side, in pixels; smaller photos stay.
     """
 
     alpha: float | str | None = None
-    scale: float = 1.0
+    scale: float | None = None
     max_size: int | None = None
 
     def __post_init__(self) -> None:
@@ -49,18 +50,29 @@ class ViewOptions:
                 raise InputError(f"alpha={self.alpha!r}, expected 'keep' or a number from 0 to 1")
         elif self.alpha is not None and not 0.0 <= self.alpha <= 1.0:
             raise InputError(f"alpha={self.alpha}, expected 'keep' or a number from 0 to 1")
-        if not 0.0 < self.scale <= _MOST_SCALE:
+        if self.scale is not None and not 0.0 < self.scale <= _MOST_SCALE:
             raise InputError(f"scale={self.scale}, expected a positive number up to {_MOST_SCALE:g}")
         if self.max_size is not None and self.max_size < 2:
             raise InputError(f"max_size={self.max_size}, expected at least 2 pixels")
 
-    def scale_for(self, width: int, height: int) -> tuple[float, int, int]:
-        """Scale, width and height of the rectified photos of raw ones of such a size; refused where nothing is left."""
-        scale = self.scale if self.max_size is None else min(self.scale, self.max_size / max(width, height))
+    def scale_for(self, width: int, height: int, raw_side: int = 0) -> tuple[float, int, int]:
+        """Scale, width and height of the rectified photos by a view of such a size; refused where OpenCV takes none.
+
+        The view is of raw photos whose longer side has `raw_side` pixels; by default, of their size.
+        """
+        longest = max(width, height)
+        scale = 1.0 if self.scale is None else self.scale * (raw_side or longest) / longest
+        said = f"scale={1.0 if self.scale is None else self.scale:g}"
+        if self.max_size is not None and self.max_size / longest < scale:
+            scale, said = self.max_size / longest, f"max_size={self.max_size}"
         # cut off, so that no pixel's centre lies beyond the last of the old ones
         across, down = (int(scale * side + 1e-9) for side in (width, height))
         if min(across, down) < 2:
-            raise InputError(f"scale={scale:g} leaves {across}x{down} pixels of {width}x{height}")
+            raise InputError(f"{said} leaves {across}x{down} pixels of {width}x{height}")
+        if max(across, down) > MAX_SIDE:
+            raise InputError(
+                f"{said} makes {across}x{down} pixels of {width}x{height}, and OpenCV fills sides up to {MAX_SIDE}"
+            )
         return scale, across, down
 
 
@@ -81,9 +93,9 @@ def rectified_view(
         The rectified camera where `view.alpha` is None.
     """
     old = as_it_was if view.alpha is None else camera.pinhole()
-    scale, width, height = view.scale_for(old.width, old.height)
+    scale, width, height = view.scale_for(old.width, old.height, max(camera.width, camera.height))
     if view.alpha is None or view.alpha == "keep" or not motions:
-        if scale == 1.0:
+        if (width, height) == (old.width, old.height):
             return old
         K = np.array(old.K)
         K[:2, 2] += 0.5  # the corner of the photo stays, not the centre of its first pixel

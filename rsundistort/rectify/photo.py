@@ -23,7 +23,7 @@ from .coarse_grid import coarse_grid
 from .maps import fill_rows, rectified_rays, seen_by
 from .pixel_depths import DepthRows
 
-__all__ = ["INTERPOLATIONS", "rectify"]
+__all__ = ["INTERPOLATIONS", "MAX_SIDE", "rectify"]
 
 #: Interpolations of `rectify` by name.
 INTERPOLATIONS: dict[str, int] = {
@@ -37,7 +37,8 @@ INTERPOLATIONS: dict[str, int] = {
 _STRIP_PIXELS = 1 << 16
 # Raw pixels from one rectified pixel to the next, up to which single samples do.
 _MAX_STEP = 1.25
-_MAX_SIDE = 32766  # cv2.remap counts in 16 bits
+#: Largest side in pixels, since cv2.remap counts in 16 bits.
+MAX_SIDE = 32766
 
 
 def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
@@ -49,8 +50,8 @@ def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
         raise InputError(f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {width}x{height}")
     if not photo.size:
         raise InputError(f"photo is {photo.dtype} {photo.shape}, which holds nothing")
-    if max(photo.shape[:2]) > _MAX_SIDE:
-        raise InputError(f"photo has {width}x{height} pixels, and OpenCV rectifies sides up to {_MAX_SIDE}")
+    if max(photo.shape[:2]) > MAX_SIDE:
+        raise InputError(f"photo has {width}x{height} pixels, and OpenCV rectifies sides up to {MAX_SIDE}")
     return photo
 
 
@@ -113,8 +114,8 @@ def rectify(
     flag = check_interpolation(interpolation)
     target = camera.pinhole() if new_camera is None else new_camera
     check_kind(target, Camera, "new_camera")
-    if max(target.width, target.height) > _MAX_SIDE:
-        raise InputError(f"new_camera has {target.width}x{target.height} pixels, OpenCV fills sides up to {_MAX_SIDE}")
+    if max(target.width, target.height) > MAX_SIDE:
+        raise InputError(f"new_camera has {target.width}x{target.height} pixels, OpenCV fills sides up to {MAX_SIDE}")
     if not target.is_pinhole:
         raise InputError("new_camera has lens distortion; a rectified photo has none")
     rays = rectified_rays(target.K, None, camera)
@@ -141,7 +142,7 @@ def _fixed_point(map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> tupl
 def _samples(camera: Camera, target: Camera) -> int:
     """Samples across a rectified pixel: as many as it covers raw pixels, going by the focal lengths."""
     shrink = max(float(camera.K[k, k] / target.K[k, k]) for k in (0, 1))
-    return 1 if shrink <= _MAX_STEP else max(1, min(math.ceil(shrink), _MAX_SIDE // target.width))
+    return 1 if shrink <= _MAX_STEP else max(1, min(math.ceil(shrink), MAX_SIDE // target.width))
 
 
 #: Fills rows of a map, from a first one on, and of the mask of what is seen; says whether all of it is.

@@ -84,13 +84,17 @@ class FramePair:
         Raises
         ------
         ReconstructionError
-            When the frames share too little.
+            When the frames share too little, or show no parallax.
         """
         camera, xy = self.camera, self.xy
         rotation = rotation_between(xy[0], xy[1], camera)
-        little = ReconstructionError(f"{self.names[0]} and {self.names[1]} share too little of the scene")
+        both = f"{self.names[0]} and {self.names[1]}"
         if rotation is None:
-            raise little
+            raise ReconstructionError(f"{both} share too little of the scene")
+        no_parallax = ReconstructionError(
+            f"{both} show the scene from one place, as far as their points tell; a camera that only rotated takes "
+            "three frames, two take one that moved"
+        )
         pair = Pair(*(View.of(each, camera) for each in xy))
         best: tuple[RelativePose, float] | None = None
         for share, within_px in product(_SHARES if readout_share is None else (readout_share,), _WITHIN_PX):
@@ -108,13 +112,13 @@ class FramePair:
             if best is None or fit.cost < best[0].cost:
                 best = fit, share
         if best is None:
-            raise little
+            raise no_parallax
         fit, share = best
         R, way = fit.R_21, fit.t_21
         motion = RowMotion(share * Rotation.from_matrix(R).as_rotvec() / camera.frame_span)
         mask = fit.distances_px(pair) < _AGREES_PX
         if mask.sum() < _LEAST_AGREEING:
-            raise little
+            raise no_parallax
         rays = [unproject_points(each[mask], camera, motion, "rotation")[0] for each in xy]
         local = cv2.triangulatePoints(np.eye(3, 4), np.column_stack([R, way]), rays[0].T, rays[1].T)
         points_w = (local[:3] / local[3]).T

@@ -36,7 +36,16 @@ from .model_frame import in_frame_of
 from .model_sequence import solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
-from .run_outputs import REPLACED, Outputs, PointRgb, check_usd, files_of_run, inputs_of, photo_times
+from .run_outputs import (
+    REPLACED,
+    Outputs,
+    PointRgb,
+    check_images_of,
+    check_usd,
+    files_of_run,
+    inputs_of,
+    photo_times,
+)
 from .survey import survey_of
 from .tracks import TrackSource
 
@@ -178,7 +187,11 @@ class _Job:
         return inputs_of(self.rectify, self.model, self.images, self.database)
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Refuse photos to rectify, before any of them is read, where their outputs would replace other files."""
+        """Refuse photos to rectify, before any of them is read, where their outputs would replace other files.
+
+        So are folders of other images or depth maps that hold none of them.
+        """
+        check_images_of(names, self.rectify)
         Record(self.out).check(files_of_run(names, self.rectify.raw_as, self.outputs), self.inputs)
 
 
@@ -217,7 +230,7 @@ def _outputs_of(job: _Job, log: StageLog, before: RunFolder) -> Outputs:
     with work_folder() as work:
         log.begin("model")
         given, track_source, kept = _given(job, work, log)
-        photos = {} if folder is None else _look_at(folder, given.reconstruction)
+        photos = {} if folder is None else _look_at(folder, given.reconstruction, job.rectify.again)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
             given = replace(given, unregistered=_others_in(folder, given, job.rectify.raw_as))
@@ -275,7 +288,7 @@ def _solve_in_memory(
     return colmap_model(rec, cameras, names, rgb.values, ids), replace(solution, stages=tuple(log.stages))
 
 
-def _look_at(folder: Path, rec: Reconstruction) -> dict[str, tuple[tuple[int, int] | None, ExifFacts]]:
+def _look_at(folder: Path, rec: Reconstruction, again: bool) -> dict[str, tuple[tuple[int, int] | None, ExifFacts]]:
     """Size and EXIF facts of each photo of a model."""
     missing = [name for name in rec.image_names if not (folder / name).is_file()]
     if missing:
@@ -283,7 +296,11 @@ def _look_at(folder: Path, rec: Reconstruction) -> dict[str, tuple[tuple[int, in
             f"{folder} lacks {len(missing)} of {rec.num_images} photos of the model, such as {missing[0]}; "
             "give the folder that the model was made from"
         )
-    return {name: (stored_size(folder / name), read_exif(folder / name)) for name in rec.image_names}
+    found = {name: (stored_size(folder / name), read_exif(folder / name)) for name in rec.image_names}
+    by = [facts.rectified_by for _, facts in found.values()]
+    if all(by) and not again:
+        raise InputError(f"{folder}: all photos were rectified already, by rsundistort {by[0]}; give the raw ones")
+    return found
 
 
 def _others_in(folder: Path, given: ColmapModel, raw_as: str) -> list[str]:

@@ -35,7 +35,17 @@ from .known_contradiction import known_contradiction
 from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
-from .run_outputs import OF_VIDEOS, REPLACED, VIDEO, Outputs, check_usd, files_of_run, inputs_of, photo_times
+from .run_outputs import (
+    OF_VIDEOS,
+    REPLACED,
+    VIDEO,
+    Outputs,
+    check_images_of,
+    check_usd,
+    files_of_run,
+    inputs_of,
+    photo_times,
+)
 from .survey import survey_of
 from .video_path import frame_path, solve_clip
 
@@ -140,6 +150,7 @@ def _solved(
     frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
     names = list_photos(folder, rectify.raw_as)
     options.outputs.check_names(names)
+    check_images_of(names, rectify)
     Record(out).check([*frames, *of_video, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
     kept.begin()
     found: Outputs | None = before.outputs(log)

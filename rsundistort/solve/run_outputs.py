@@ -16,6 +16,7 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
+from ..batch.extras import find_extras
 from ..batch.geometry import DEPTHS, PhotoGeometry, SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
 from ..batch.one_photo import applied_part
@@ -39,6 +40,7 @@ from ..io import (
     write_trajectory,
     write_transforms,
 )
+from ..io.depth_maps import find_depth_maps
 from ..io.export_scene import ExportScene
 from ..io.exports import EXPORTS, check_exports
 from ..io.journal import Journal
@@ -56,7 +58,17 @@ from ..report import Diagnostics, relative_folder, write_diagnostics, write_repo
 from .outcome import Solved, solution_of
 from .run_options import OutputOptions, SolveOptions
 
-__all__ = ["OF_VIDEOS", "REPLACED", "VIDEO", "Outputs", "check_usd", "files_of_run", "inputs_of", "photo_times"]
+__all__ = [
+    "OF_VIDEOS",
+    "REPLACED",
+    "VIDEO",
+    "Outputs",
+    "check_images_of",
+    "check_usd",
+    "files_of_run",
+    "inputs_of",
+    "photo_times",
+]
 
 #: Folders that a run replaces.
 REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses", *EXPORTS)
@@ -88,6 +100,15 @@ def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> l
     files += [f"{name}/{file}" for name in options.exports for file in EXPORTS[name].files]
     masks = mask_names(names)
     return files + [each for n in names for each in (f"images/{output_name(n, raw_as)}", f"masks/{masks[n]}")]
+
+
+def check_images_of(names: Sequence[str], options: RectifyOptions) -> None:
+    """Refuse, before any work, folders of other images or depth maps that hold none of these photos."""
+    if not names:
+        return
+    find_extras(options.also, names)
+    if str(options.depth) not in DEPTHS:
+        find_depth_maps(Path(options.depth).absolute(), names)
 
 
 def check_usd(options: OutputOptions, is_clip: bool) -> None:

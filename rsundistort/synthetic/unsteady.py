@@ -261,7 +261,7 @@ def tracks(log: GyroLog, cameras: list[Camera], readout_s: float | None, seed: i
     """
     readout_s = log.readout_s if readout_s is None else readout_s
     if readout_s is None or not (readout_s > 0 and np.isfinite(readout_s)):
-        raise InputError("how long does the camera take to read a frame, in the time of the gyroscope's log?")
+        raise InputError("the gyroscope's log does not say how long a frame is read; give --readout-ms")
     starts = log.time_s[np.isfinite(log.mean(log.time_s, log.time_s + readout_s)).all(axis=1)]
     if not len(starts):
         raise InputError(f"the gyroscope's log has no stretch of {readout_s:g} s without a gap")

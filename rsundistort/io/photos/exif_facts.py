@@ -17,6 +17,7 @@ from .exif import EXIF_IFD, GPS_IFD, ORIENTATION, Damaged, TiffStructure
 from .gps import GpsFix, fix_of
 from .heif import heif_metadata
 from .kinds import kind_of_content
+from .xmp import rectified_by
 
 __all__ = ["ExifFacts", "camera_from_exif", "facts_of_exif", "focal_from_exif", "read_exif"]
 
@@ -56,6 +57,8 @@ class ExifFacts:
         When it was taken, by the camera's clock: seconds since the beginning of 1970 there.
     exposure_s : float or None
         How long the shutter was open, seconds.
+    rectified_by : str or None
+        Version of rsundistort that rectified the photo, of XMP.
     """
 
     make: str | None = None
@@ -73,6 +76,7 @@ class ExifFacts:
     exposure_s: float | None = None
     flash: bool | None = None
     fix: GpsFix | None = None
+    rectified_by: str | None = None
 
     @property
     def place_deg(self) -> tuple[float, float] | None:
@@ -102,17 +106,18 @@ def read_exif(path: Path) -> ExifFacts:
 def facts_of_exif(block: bytes, xmp: bytes = b"") -> ExifFacts:
     """The facts of an EXIF block, a TIFF structure with or without the head that it has in a JPEG; as `read_exif`.
 
-    An XMP packet contains more on the position.
+    An XMP packet contains more on the position, and that a photo was rectified.
     """
+    by = rectified_by(xmp)
     try:
         structure = TiffStructure(block.removeprefix(b"Exif\0\0"))
         main = structure.main()[0]
         entries = {**structure.sub(main, EXIF_IFD, "the Exif IFD"), **main}
         gps = structure.sub(main, GPS_IFD, "the GPS IFD")
         facts = _facts({tag: structure.first_value(entry) for tag, entry in entries.items()})
-        return replace(facts, fix=fix_of(structure, gps, xmp))
+        return replace(facts, fix=fix_of(structure, gps, xmp), rectified_by=by)
     except Damaged:
-        return ExifFacts(fix=fix_of(TiffStructure(_EMPTY), {}, xmp))
+        return ExifFacts(fix=fix_of(TiffStructure(_EMPTY), {}, xmp), rectified_by=by)
 
 
 def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
