@@ -372,3 +372,20 @@ def test_solutions_are_consistent_in_any_frame_and_scale_but_not_with_a_side_of_
     off[2] = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix() @ off[2]
     assert not consistent(scene, replace(scene, R_cw=off))
     assert not consistent(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))
+
+
+@pytest.mark.parametrize("rad", [0.02])
+def test_other_features_are_taken_if_they_explain_more(scene, matched, rng, tmp_path):
+    (tmp_path / "few").mkdir()
+    some = scene.observations.select(np.arange(len(scene.observations)) % 3 > 0)
+    fewer = matched_scene(replace(scene, observations=some), rng, tmp_path / "few" / "database.db", share_wrong=0.2)
+    few, many = (
+        Registrar(TrackSource(each, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
+        for each in (fewer, matched)
+    )
+    start = bundle_adjust(scene, "rotation", rough_options(BundleOptions()))
+    taken, found, left_out = few.with_features(many.track_source, start, {"9.jpg"})
+    assert taken.track_source is many.track_source
+    assert apart_deg(found.reconstruction, scene).max() < 0.1
+    assert not left_out
+    assert many.with_features(few.track_source, start, {"9.jpg"}) == (many, start, {"9.jpg"})

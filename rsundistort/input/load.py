@@ -19,6 +19,7 @@ from ..io.kept import Kept
 from ..io.outputs import work_folder
 from ..io.photos.images import stored_size, unread_pictures
 from ..io.places import local_place
+from ..model import Camera, Reconstruction, RowMotion
 from ..sfm import (
     DETECTION_MEGAPIXELS,
     Features,
@@ -33,6 +34,7 @@ from ..sfm import (
     reduce_photo,
 )
 from .photo_cameras import PhotoCameras, find_cameras
+from .without_motion import FrameWithoutMotion, photo_without_motion
 
 __all__ = ["LONG_EXPOSURE_S", "UNCONNECTED", "LoadedPhotos", "OtherFeatures", "load_photos"]
 
@@ -118,6 +120,9 @@ class _LoadJob:
     max_megapixels: float
     again: bool
     coarse: bool
+    # taken out of the photo before features are detected
+    camera: Camera | None = None
+    motion: RowMotion | None = None
 
 
 @dataclass(frozen=True)
@@ -173,7 +178,8 @@ def _bytes_of(job: _LoadJob) -> float:
         return 0.0
     if width * height > job.max_megapixels * 1e6:
         return 0.0
-    return detection_bytes(width, height, job.megapixels) + _BYTES_PER_PIXEL * width * height
+    per_pixel = _BYTES_PER_PIXEL * (1 if job.motion is None else 2)
+    return detection_bytes(width, height, job.megapixels) + per_pixel * width * height
 
 
 def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -> list[str]:
@@ -298,13 +304,36 @@ class OtherFeatures:
 
         A strong shutter shears surroundings. Of leaves and grass the usual features match better.
         """
-        jobs, key = self._jobs(), "affine features of {}".format
-        found: dict[str, Features] = {job.name: old for job in jobs if (old := self.kept.get(key(job.name)))}
+        features = self._detect(self._jobs(), "affine features", self.kept, affine=True)
+        return self._with("affine features", features, len(features))
+
+    def without_motions(self, rec: Reconstruction, before: Sequence[Features]) -> LoadedPhotos:
+        """Those of registered photos of a reconstruction as they are without lens and rotation, where the photos are.
+
+        A strong shutter shears what a feature is described by. Those of the shape of their surroundings are among them
+        if they are in `before`. Other photos keep their features before, and so do those of a fisheye, which no pinhole
+        camera can show.
+        """
+        index_of = {name: i for i, name in enumerate(rec.image_names) if rec.camera(i).lens != "fisheye"}
+        jobs = [
+            replace(job, camera=rec.camera(index_of[job.name]), motion=RowMotion(rec.phi[index_of[job.name]]))
+            for job in self._jobs()
+            if job.name in index_of
+        ]
+        stage, affine = "features without motions", any(each.kind is not None for each in before)
+        found = dict(zip([job.name for job in jobs], self._detect(jobs, stage, Kept(), affine=affine), strict=True))
+        features = [found.get(name, old) for name, old in zip(self.photos.names, before, strict=True)]
+        return self._with(stage, features, len(jobs))
+
+    def _detect(self, jobs: list[_LoadJob], stage: str, kept: Kept, *, affine: bool) -> list[Features]:
+        """The usual features of all pixels that are allowed, and `affine` ones beside them."""
+        key = f"{stage} of {{}}".format
+        found: dict[str, Features] = {job.name: old for job in jobs if (old := kept.get(key(job.name)))}
         left = [job for job in jobs if job.name not in found]
         workers = self.workers
         if left and not workers.scheduler:
             workers = workers.fitting("features", max(map(_bytes_of, left)))
-        self.log.begin("affine features", len(jobs), len(found))
+        self.log.begin(stage, len(jobs), len(found))
         results = workers.map(_reduce, left, lambda job, why: _Reduced(problem=f"{job.name}: {why}"))
         with closing(results):
             for start in range(0, len(left), _AT_ONCE * workers.jobs):
@@ -313,14 +342,18 @@ class OtherFeatures:
                 if lost := [each.problem for each in reduced if each.photo is None]:
                     raise FileError(lost[0])
                 photos = [each.photo for each in reduced if each.photo is not None]
-                with work_folder() as work:
-                    affine = detect_affine_features(photos, self.max_features, workers.jobs, work)
-                    for job, each, other in zip(some, reduced, affine, strict=True):
-                        assert each.features is not None
-                        found[job.name] = features_of_both(each.features, other)
-                        self.kept.put(key(job.name), found[job.name])
-                self.log.tell("affine features", len(found), len(jobs))
-        return self._with("affine features", [found[job.name] for job in jobs], len(jobs))
+                others = self._affine_of(photos, workers.jobs) if affine else [None] * len(photos)
+                for job, each, other in zip(some, reduced, others, strict=True):
+                    assert each.features is not None
+                    features = each.features if other is None else features_of_both(each.features, other)
+                    found[job.name] = features if each.frame is None else each.frame.in_photo(features)
+                    kept.put(key(job.name), found[job.name])
+                self.log.tell(stage, len(found), len(jobs))
+        return [found[job.name] for job in jobs]
+
+    def _affine_of(self, photos: list[ReducedPhoto], num_threads: int) -> list[Features]:
+        with work_folder() as work:
+            return list(detect_affine_features(photos, self.max_features, num_threads, work))
 
     def _jobs(self) -> list[_LoadJob]:
         photos = self.photos
@@ -342,6 +375,7 @@ class _Reduced:
     photo: ReducedPhoto | None = None
     features: Features | None = None
     problem: str = ""
+    frame: FrameWithoutMotion | None = None
 
 
 def _reduce(job: _LoadJob) -> _Reduced:
@@ -351,8 +385,12 @@ def _reduce(job: _LoadJob) -> _Reduced:
         return _Reduced(problem=str(error))
     height, width = photo.pixels.shape[:2]
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
-    usual = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
-    return _Reduced(reduce_photo(photo.pixels, mask, job.megapixels), usual)
+    pixels, megapixels, frame = photo.pixels, job.megapixels, None
+    if job.camera is not None and job.motion is not None:
+        pixels, mask, frame = photo_without_motion(pixels, mask, job.camera, job.motion, megapixels)
+        megapixels *= frame.area_ratio
+    usual = detect_features(pixels, job.max_features, mask, megapixels)
+    return _Reduced(reduce_photo(pixels, mask, megapixels), usual, frame=frame)
 
 
 def _read(

@@ -44,6 +44,7 @@ def detect_affine_features(
     options.use_gpu, options.num_threads = False, num_threads
     options.max_image_size = max(side for photo in photos for side in photo.gray.shape)
     options.sift.estimate_affine_shape = options.sift.domain_size_pooling = True
+    options.sift.first_octave = 0
     # masks leave some out
     most = max_features if all(photo.mask is None for photo in photos) else max(photo.gray.size for photo in photos)
     options.sift.max_num_features = most

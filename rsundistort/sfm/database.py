@@ -31,6 +31,7 @@ __all__ = [
     "ideal_keypoints",
     "pipeline_options",
     "verification_options",
+    "without_motions",
     "write_photos",
 ]
 
@@ -93,6 +94,28 @@ def ideal_keypoints(
         xy = ideal @ camera.K[:2, :2].T + camera.K[:2, 2]
     xy[~valid] = -1e4
     return (xy + HALF).astype(np.float32)
+
+
+def without_motions(matched: MatchedPhotos, phi: Array, own: Sequence[Camera] | None = None) -> MatchedPhotos:
+    """Photos whose keypoints have neither lens nor rotation, and cameras that have no lens either.
+
+    Parameters
+    ----------
+    phi : (m, 3) array
+        Rotations that are taken out, radians per unit of the clock.
+    own : m cameras, optional
+        Those at the time of each photo, if they vary.
+    """
+    cameras = [matched.cameras[k] for k in matched.camera_idx]
+    features = [
+        replace(
+            found, xy_raw=ideal_keypoints(found, camera, RowMotion(each), "rotation", of_photo).astype(float) - HALF
+        )
+        for found, camera, each, of_photo in zip(matched.features, cameras, phi, own or cameras, strict=True)
+    ]
+    # what a fisheye shows has no place in a pinhole photo
+    ideal = [camera.without_field() if camera.lens == "fisheye" else camera.pinhole() for camera in matched.cameras]
+    return replace(matched, features=features, cameras=ideal)
 
 
 def write_photos(db: Any, matched: MatchedPhotos, limit: int | None = None) -> None:

@@ -70,8 +70,12 @@ class Features:
 
     def largest(self, count: int) -> Features:
         """The largest of them, of this number."""
-        kind = None if self.kind is None else self.kind[:count]
-        return Features(self.xy_raw[:count], self.sigma[:count], self.descriptors[:count], self.step_px, kind)
+        return self.take(np.arange(min(count, len(self.xy_raw))))
+
+    def take(self, indices: Index) -> Features:
+        """Some of them."""
+        kind = None if self.kind is None else self.kind[indices]
+        return Features(self.xy_raw[indices], self.sigma[indices], self.descriptors[indices], self.step_px, kind)
 
     def of_kind(self, kind: int) -> Index:
         """Indices of those of a kind."""

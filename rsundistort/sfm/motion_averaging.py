@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..colmap.conventions import HALF, quiet_pycolmap
-from ..model import Reconstruction, RowMotion
+from ..colmap.conventions import quiet_pycolmap
+from ..model import Reconstruction
 from ..model.array_types import Array, Index
-from .database import MatchedPhotos, ideal_keypoints, write_photos
+from .database import MatchedPhotos, without_motions, write_photos
 from .epipolar import MIN_EXPLAINED, read_matches
 from .mapping import map_photos
 from .matching import verify_loosely
@@ -115,15 +115,8 @@ def map_without_motions(
     pairs = {key: pair_of(matched, key, found) for key, found in matches.items()}
     known = {matched.names.index(name): each for name, each in (known_phi or {}).items()}
     phi = averaged_motions(len(matched.names), pairs, phi_sigma, known)
-    cameras = [matched.cameras[k] for k in matched.camera_idx]
-    features = [
-        replace(found, xy_raw=ideal_keypoints(found, camera, RowMotion(each), "rotation").astype(np.float64) - HALF)
-        for found, camera, each in zip(matched.features, cameras, phi, strict=True)
-    ]
-    # what a fisheye shows has no place in a pinhole photo
-    ideal = [camera.without_field() if camera.lens == "fisheye" else camera.pinhole() for camera in matched.cameras]
     folder = Path(tempfile.mkdtemp(prefix="without-motions-", dir=matched.database.parent))
-    moved = replace(matched, database=folder / "database.db", features=features, cameras=ideal)
+    moved = replace(without_motions(matched, phi), database=folder / "database.db")
     with quiet_pycolmap().Database.open(moved.database) as db:
         write_photos(db, moved)
         for (first, second), found in matches.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -33,10 +34,10 @@ from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
 from ..model import Reconstruction
-from ..sfm import read_num_verified
+from ..sfm import MatchedPhotos, read_num_verified
 from ..verdict import Verdict, judge
 from .outcome import Solved
-from .placing import place_photos
+from .placing import match_without_motions, place_photos
 from .registering import Registrar, warn_of_left_out
 from .solutions import consistent
 from .survey import Survey
@@ -119,21 +120,26 @@ def solve_photos(
     """
     place = partial(place_photos, log=log, seed=seed, matching=matching, kept=kept or Kept(), with_shutter=True)
 
+    source_of = partial(TrackSource, photos=photos, workers=workers, mapped_here=True)
+
+    def without_motions(before: MatchedPhotos, rec: Reconstruction) -> TrackSource:
+        assert other is not None
+        loaded = other.without_motions(rec, before.features)
+        folder = Path(tempfile.mkdtemp(prefix="without-motions-", dir=scratch))
+        return source_of(match_without_motions(loaded, rec, folder, log, seed, matching))
+
     @cache
     def of_affine(is_strong: bool) -> tuple[Reconstruction, TrackSource]:
         assert other is not None
         folder = scratch / "affine"
         folder.mkdir()
         mapped, matched = place(other.affine(), folder, is_strong=is_strong)
-        return mapped, TrackSource(matched, photos, workers, mapped_here=True)
+        return mapped, replace(source_of(matched), without_motions=partial(without_motions, matched))
 
     mapped, matched = place(photos, scratch, other=other)
     check_enough(mapped, len(photos.names))
     num_verified = read_num_verified(matched)
-    source = TrackSource(
-        matched, photos, workers, mapped_here=True,
-        of_affine=None if other is None else of_affine, always_affine=always_affine,
-    )  # fmt: skip
+    source = replace(source_of(matched), of_affine=None if other is None else of_affine, always_affine=always_affine)
     solved = solve_tracks(mapped, photos.cameras, shutter_model, seed, options_of, log, remedy, source, survey)
     lost = photos.unregistered(solved.shared.image_names, num_verified)
     solved = replace(solved, unregistered=lost, camera_of=photos.camera_of)
@@ -195,6 +201,8 @@ def solve_tracks(
         more = _by_affine_features(track_source, result, partial(solve, options_of=options_of), strong)
         if more is not None:
             return more
+        registrar, result, left_out = registrar.without_motions(result, left_out)
+        track_source = registrar.track_source
         warn_of_left_out(left_out)
         options = of_registered(wanted, result.reconstruction)
         result, tracks, options = retriangulated(track_source, result, options, log, ends=not auto)

@@ -17,10 +17,11 @@ from ..io.kept import Kept
 from ..model import Reconstruction
 from ..model.array_types import Index
 from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
+from ..sfm.database import without_motions
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, close_px, match_more
 
-__all__ = ["place_photos"]
+__all__ = ["match_without_motions", "place_photos"]
 
 # Verified matches of a pair that overlaps, beyond doubt.
 _MANY = 100
@@ -136,6 +137,30 @@ def _match(
         kept.put(f"pairs{detail}", counts)
     log.end("matching", **counts)
     return matched if not photos.coarse or _all_are_rich(matched) else None
+
+
+def match_without_motions(
+    photos: LoadedPhotos, rec: Reconstruction, folder: Path, log: StageLog, seed: int, matching: str
+) -> MatchedPhotos:
+    """Photos matched again, with pairs verified by keypoints without the motions of a reconstruction of them.
+
+    Parameters
+    ----------
+    folder : Path
+        For the database.
+    """
+    log.begin("matching without motions")
+    idx = photos.cameras.camera_idx
+    own, phi = [rec.cameras[k] for k in idx], np.zeros((len(idx), 3))
+    for i, name in enumerate(rec.image_names):
+        k = photos.names.index(name)
+        own[k], phi[k] = rec.camera(i), rec.phi[i]
+    matched = MatchedPhotos(folder / "database.db", photos.names, photos.features, rec.cameras, idx, True, seed)
+    moved = without_motions(matched, phi, own)
+    pairs = pairs_to_match(photos, matching, seed)
+    match_photos(moved.database, moved.names, moved.features, moved.cameras, idx, seed=seed, pairs=pairs)
+    log.end("matching without motions", pairs=len(read_num_verified(matched)))
+    return matched
 
 
 def _detail(photos: LoadedPhotos) -> str:

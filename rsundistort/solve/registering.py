@@ -132,6 +132,27 @@ class Registrar:
             return False
         return num_explained(tracks) < num_explained(former)
 
+    def without_motions(self, result: BundleResult, left_out: set[str]) -> tuple[Registrar, BundleResult, set[str]]:
+        """The solution by features of the photos without its motions, if these are strong and it is a better one."""
+        detect = self.track_source.without_motions
+        if detect is None or not is_strong(result.reconstruction):
+            return self, result, left_out
+        return self.with_features(detect(result.reconstruction), result, left_out)
+
+    def with_features(
+        self, source: TrackSource, result: BundleResult, left_out: set[str]
+    ) -> tuple[Registrar, BundleResult, set[str]]:
+        """The solution by other features of its photos, if these explain more measurements, and as many photos."""
+        other = Registrar(source, self.wanted, self.log)
+        try:
+            found, found_left_out = other.all_registered(result, again=False)
+        except ReconstructionError:
+            return self, result, left_out
+        more, fewer = other._new_tracks(found.reconstruction), self._new_tracks(result.reconstruction)
+        if more.num_images < fewer.num_images or num_explained(more) <= num_explained(fewer):
+            return self, result, left_out
+        return other, found, found_left_out
+
     def suspects(self, reconstruction: Reconstruction) -> list[str]:
         """Photos that may have a wrong place, since matches with the others contradict it."""
         # measurements that were aligned are no keypoints any more

@@ -65,6 +65,8 @@ class TrackSource:
     of_affine : callable or None
         Gives a mapping, and the source, of features that a strong shutter leaves as they are, by whether there is one;
         None if there are none.
+    without_motions : callable or None
+        Gives the source of features of the photos without the motions of a reconstruction; None if there are none.
     always_affine : bool
         Whether one photo that is left out is reason enough for these.
     """
@@ -74,6 +76,7 @@ class TrackSource:
     workers: Workers | None = None
     mapped_here: bool = False
     of_affine: Callable[[bool], tuple[Reconstruction, TrackSource]] | None = None
+    without_motions: Callable[[Reconstruction], TrackSource] | None = None
     always_affine: bool = False
 
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
