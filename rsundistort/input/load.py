@@ -51,7 +51,7 @@ _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
 # 0.85 of the time, and loses 0.8 dB on warped herz-jesus-8.)
 _COARSE, _MANY_FEATURES = 1 / 3, 3000
 
-# Photos for each thread that go to pycolmap at once: a few, since an interruption waits for them (six seconds each).
+# Photos for each thread that go to pycolmap at once: a few, since an interruption waits for them (four seconds each).
 _AT_ONCE = 2
 
 _NUMBERS = {2: "two", 3: "three"}

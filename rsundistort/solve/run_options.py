@@ -199,7 +199,7 @@ class RunOptions(_Part):
         these show matches well enough.
     features : {"auto", "affine"}
         What is done if photos are left out. "affine": all get features of the shape of their surroundings, too
-        (`sfm.affine_features`), by which photos match that look from sides further apart; they take nine times as long,
+        (`sfm.affine_features`), by which photos match that look from sides further apart; they take six times as long,
         and the solution with more photos counts. "auto": only if a strong shutter may be why.
     every, sharpest : int, optional
         For a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`; by default its frames
