@@ -79,7 +79,7 @@ _measure_options = opt.gathered(
         type=click.Choice(("auto", "affine")),
         default="auto",
         help="If photos are not registered, affine: also detect features of the shape of their surroundings, "
-        "which match between photos from sides further apart, and keep the solution with more photos; they take nine "
+        "which match between photos from sides further apart, and keep the solution with more photos; they take six "
         "times as long. auto: do so only if a strong shutter may be why.",
     ),
     click.option(

@@ -298,7 +298,7 @@ def _look_at(folder: Path, rec: Reconstruction, again: bool) -> dict[str, tuple[
         )
     found = {name: (stored_size(folder / name), read_exif(folder / name)) for name in rec.image_names}
     by = [facts.rectified_by for _, facts in found.values()]
-    if all(by) and not again:
+    if by and all(by) and not again:
         raise InputError(f"{folder}: all photos were rectified already, by rsundistort {by[0]}; give the raw ones")
     return found
 
