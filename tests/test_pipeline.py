@@ -317,6 +317,8 @@ def test_options_of_another_kind_are_refused(tmp_path):
         RectifyOptions(max_megapixels=-1)
     with pytest.raises(InputError, match="known motion of 'a': expected phi and sigma of three numbers each"):
         SolveOptions(known={"a": ([0, 0], [1, 1, 1])})
+    with pytest.raises(InputError, match="known motion of 'a': expected phi and sigma of three numbers each"):
+        SolveOptions(known={"a": 1})
 
 
 def test_number_of_jobs_is_checked(tmp_path):

@@ -36,6 +36,9 @@ def test_the_readout_time_is_reported_with_its_evidence():
     assert facts["readout time"].endswith("(0.61 of the frame), what was known before")
     assert facts["gyroscope"] == "axes yxz, offset -17.7 +- 0.2 ms, correlation 0.999"
     assert "its halves say" not in facts
+    # of two frames each
+    facts = dict(readout_facts({**STATED, "halves": [{"seconds": 0.02, "sigma": float("inf")}] * 2}))
+    assert facts["its halves say"].startswith("20.0 ms, of unknown standard deviation and")
 
 
 @pytest.mark.parametrize(

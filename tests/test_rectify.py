@@ -233,8 +233,20 @@ def test_wrong_photos_and_cameras_are_refused_by_name():
         init_rectify_map(camera, R=2 * np.eye(3))
     with pytest.raises(InputError, match="new_K is singular"):
         init_rectify_map(camera, new_K=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="P is singular"):
+        undistort_points(np.zeros((1, 2)), camera, P=np.zeros((3, 3)))
+    with pytest.raises(InputError, match=r"P.shape=\(3, 5\), expected \(3, 3\)"):
+        undistort_points(np.zeros((1, 2)), camera, P=np.zeros((3, 5)))
     with pytest.raises(InputError, match=r"size\[0\]=0, expected a positive"):
         init_rectify_map(camera, size=(0, 5))
+
+
+def test_projection_matrices_are_those_of_opencv():
+    camera, xy = make_camera(LENS), np.array([[10.0, 20.0], [120.0, 130.0]])
+    P = np.column_stack([camera.K, [7.0, 8.0, 9.0]])
+    found = undistort_points(xy, camera, P=P)
+    np.testing.assert_allclose(found, cv2.undistortPoints(xy, camera.K, camera.dist, P=P)[:, 0], atol=1e-3)
+    np.testing.assert_allclose(distort_points(found, camera, P=P), xy, atol=1e-9)
 
 
 motions = pytest.mark.parametrize("motion", [MOTION, STRONG, RowMotion(-STRONG.phi)], ids=["some", "strong", "back"])

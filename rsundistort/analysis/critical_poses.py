@@ -9,6 +9,7 @@ import numpy as np
 from ..critical import advise_poses, critical_motion
 from ..errors import FileError, InputError
 from ..io import read_colmap_poses, read_solution, read_transforms
+from ..io.places import local_place
 from ..model import check_readout
 from ..model.orientation import in_stored_frame
 from .results import PoseAnalysis
@@ -32,7 +33,7 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
         The degeneracy measure of the poses; what the shape of a solution is worth; advice for the next shoot, if they
         are critical.
     """
-    path = Path(path)
+    path = local_place(path)
     if readout is not None:
         check_readout(readout)
     if not path.exists():

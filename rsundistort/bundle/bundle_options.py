@@ -26,9 +26,10 @@ __all__ = ["DEVIATIONS", "BundleOptions", "BundleResult"]
 DEVIATIONS = ("jackknife", "model")
 
 
-def _known(name: str, phi: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array]:
+def _known(name: str, known: tuple[ArrayLike, ArrayLike]) -> tuple[Array, Array]:
     """A known motion, checked."""
     try:
+        phi, sigma = known
         values, sigmas = (np.array(np.broadcast_to(np.asarray(value, np.float64), 3)) for value in (phi, sigma))
     except (TypeError, ValueError) as error:
         raise InputError(f"known motion of {name!r}: expected phi and sigma of three numbers each") from error
@@ -211,7 +212,7 @@ class BundleOptions:
         check_fields(self)
         object.__setattr__(self, "refine", check_refined(self.refine))
         object.__setattr__(self, "lengths", check_lengths(self.lengths))
-        known = {name: _known(name, *value) for name, value in self.known_phi.items()}
+        known = {name: _known(name, value) for name, value in self.known_phi.items()}
         object.__setattr__(self, "known_phi", known)
         for name, components in self.held_phi.items():
             if any(component not in (0, 1, 2) for component in components):

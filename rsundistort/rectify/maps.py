@@ -22,13 +22,13 @@ __all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
 EDGE_PX = 1e-3
 
 
-def rectified_rays(new_K: ArrayLike | None, R: ArrayLike | None, camera: Camera) -> Array:
+def rectified_rays(new_K: ArrayLike | None, R: ArrayLike | None, camera: Camera, name: str = "new_K") -> Array:
     """(3, 3) matrix from rectified pixels (u, v, 1) to directions in the camera frame."""
-    K = camera.K if new_K is None else check_finite(new_K, (3, 3), "new_K")
+    K = camera.K if new_K is None else check_finite(new_K, (3, 3), name)
     rotation = np.eye(3) if R is None else check_rotation(R, "R")
     scaled = K / max(np.abs(K).max(), 1e-300)
     if abs(np.linalg.det(scaled)) < 1e-18:
-        raise InputError("new_K is singular")
+        raise InputError(f"{name} is singular")
     return rotation.T @ np.linalg.inv(K)
 
 

@@ -57,8 +57,9 @@ def _checked(
     depth = AtInfinity() if depth is None else depth
     if isinstance(depth, DepthMap) and P is None:
         raise InputError("a depth map has the pixels of the rectified photo: P is needed")
-    motion, P = motion_of(camera, motion), np.eye(3) if P is None else P
-    return xy.reshape(-1, 2), xy.shape, motion, rectified_rays(P, R, camera), depth
+    K = np.eye(3) if P is None else check_finite(P, (3, None), "P")
+    rays = rectified_rays(K[:, :3] if K.shape[1] == 4 else K, R, camera, "P")
+    return xy.reshape(-1, 2), xy.shape, motion_of(camera, motion), rays, depth
 
 
 def _rectified(
@@ -139,8 +140,9 @@ def undistort_points(
         As in `init_rectify_map`.
     R : (3, 3) array, optional
         Rotation from the camera frame to the rectified one.
-    P : (3, 3) array, optional
-        Pinhole matrix of the rectified photo. Without it the result is in normalised coordinates.
+    P : (3, 3) or (3, 4) array, optional
+        Pinhole matrix of the rectified photo; a fourth column is ignored, as by `cv2`. Without it the result is in
+        normalised coordinates.
     depth : AtInfinity, Plane, DepthMap or (n,) array, optional
         How far the points are, which constant-motion needs: as in `init_rectify_map` (a map needs P, of which it has
         the pixels), or each point's z in the rectified frame at the reference row. At infinity when left out.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..verdict.judge_path import problem_of
+from ..verdict.judge_path import in_ms, problem_of
 
 __all__ = ["map_facts", "map_rows", "readout_facts"]
 
@@ -84,7 +84,7 @@ def map_rows(georeference: Mapping[str, Any] | None) -> dict[str, list[dict[str,
 
 
 def _time(evidence: Mapping[str, Any]) -> str:
-    return f"{1e3 * evidence['seconds']:.1f} +- {1e3 * evidence['sigma']:.1f} ms"
+    return in_ms(evidence["seconds"], evidence["sigma"])
 
 
 def readout_facts(evidence: Mapping[str, Any]) -> list[tuple[str, str]]:

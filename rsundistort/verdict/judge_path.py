@@ -15,7 +15,7 @@ from ..rectify import largest_shift_px
 from .judge import UNSEEN_PX, Verdict, height_reasons, loose_reasons, unexplained_reasons
 from .speeds import BySpeed, ReadoutTime
 
-__all__ = ["BY_SLOW_ROTATIONS", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
+__all__ = ["BY_SLOW_ROTATIONS", "SIGMAS", "ReadoutTime", "in_ms", "judge_clip", "problem_of", "unfollowed_px"]
 
 #: Source of a readout time that the path says nothing about.
 BY_SLOW_ROTATIONS = "slow rotations of the video"
@@ -191,6 +191,12 @@ def unfollowed_px(reconstruction: Reconstruction, own: OwnMotions) -> float:
     return float(np.sqrt(max(np.median((apart**2)[known]) / 0.455 - np.median((sigma**2)[known]), 0.0)))
 
 
+def in_ms(seconds: float, sigma: float) -> str:
+    """A readout time with its standard deviation, which nothing may tell."""
+    said = f"+- {1e3 * sigma:.1f} ms" if np.isfinite(sigma) else "ms, of unknown standard deviation"
+    return f"{1e3 * seconds:.1f} {said}"
+
+
 def problem_of(evidence: Mapping[str, Any]) -> str:
     """Why a video does not determine its readout time, by `quality.readout_time`; empty if it does."""
     stabilised = evidence.get("stabilisation") or {}
@@ -200,9 +206,9 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         return "the video does not determine it better than it was known before"
     seconds, sigma = evidence["seconds"], evidence["sigma"]
     if not abs(seconds) > SIGMAS * sigma:
-        return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
+        return f"the camera moved too little: {in_ms(seconds, sigma)}"
     if _is_backwards(ReadoutTime(seconds, sigma)):
-        return f"{1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms: {_BACKWARDS}"
+        return f"{in_ms(seconds, sigma)}: {_BACKWARDS}"
     if evidence.get("unfollowed_px", 0.0) > UNSEEN_PX:
         return f"the frames rotate by {evidence['unfollowed_px']:.1f} px more than their path explains: {_VIBRATES}"
     if evidence.get("halves"):
