@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, bundle_adjust
+from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.model.similarity import Similarity
-from rsundistort.sfm import map_photos, map_without_motions, read_num_verified, register_photos
+from rsundistort.sfm import map_photos, map_without_motions, read_num_verified, register_photos, verification
 from rsundistort.sfm.contradiction import contradicting_photos, parts_that_agree
 from rsundistort.sfm.epipolar import agreeing_photos, read_matches
 from rsundistort.sfm.motion_averaging import averaged_motions
@@ -71,6 +72,19 @@ def scene(rng, rad):
 def matched(scene, rng, tmp_path):
     """Its measurements as keypoints, all photos matched with each other, every fifth match wrong."""
     return matched_scene(scene, rng, tmp_path / "database.db", share_wrong=0.2)
+
+
+def test_pairs_that_pycolmap_found_no_geometry_for_are_verified_with_a_shutter(matched, monkeypatch):
+    def find_none(_):
+        pycolmap = quiet_pycolmap()
+        with pycolmap.Database.open(matched.database) as db:
+            for first, second in read_matches(matched):
+                db.delete_two_view_geometry(first + 1, second + 1)
+                db.write_two_view_geometry(first + 1, second + 1, pycolmap.TwoViewGeometry())
+
+    monkeypatch.setattr(verification, "verify_loosely", find_none)
+    verification.verify_with_shutter(matched, is_strong=True)
+    assert {*read_num_verified(matched)} == {*read_matches(matched)}
 
 
 def one_photo(scene, photo):

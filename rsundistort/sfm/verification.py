@@ -104,7 +104,8 @@ def _add_explained(matched: MatchedPhotos, matches: Matches, spread: float) -> N
             if pycolmap.image_pair_to_pair_id(*ids) in verified:
                 geometry = db.read_two_view_geometry(*ids)
                 explained = np.unique(np.concatenate([explained, np.asarray(geometry.inlier_matches)]), axis=0)
-                db.delete_two_view_geometry(*ids)
+            # a pair that was found to have no geometry has an entry, too
+            db.delete_two_view_geometry(*ids)
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             geometry.inlier_matches = explained.astype(np.uint32)
             db.write_two_view_geometry(*ids, geometry)
