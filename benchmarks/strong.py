@@ -21,6 +21,7 @@ Prints one JSON object a line and at the end a table. Parts:
               the true motions, how many photos these connect (`sfm.firmly_connected`), and the adjustment of these
               tracks from the true poses and motions; and what mapping registers with the pairs as they were verified
               and the true motions taken out of the keypoints
+    search    the same tracks without one fourth of the photos, in turns: the motions that a search finds for these
     fountain  fountain-small with its velocity three times as large
     weak      processor time of `run` on herz-jesus-8 as it is and warped by 0.02 rad, of this state over that of the
               checkout --before, by turns, and whether both write the same solution; without --before it is left out
@@ -41,8 +42,8 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,7 @@ from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.errors import InputError
 from rsundistort.evaluation import psnr
 from rsundistort.input.load import LoadedPhotos, load_photos
+from rsundistort.input.motion_search import search_motions
 from rsundistort.input.photo_cameras import camera_file_of
 from rsundistort.io import read_photo
 from rsundistort.io.cameras import camera_to_json
@@ -81,11 +83,13 @@ from rsundistort.solve.run_outputs import Outputs
 ROOT = Path(__file__).resolve().parent.parent
 # RANSAC draws at random: areas of others are means of so many draws.
 DRAWS = 6
-PARTS, SETS = ("sets", "pairs", "limit", "matches", "fountain", "weak"), ("herz-jesus-8", "dslr")
+PARTS = "sets", "pairs", "limit", "matches", "search", "fountain", "weak"
+SETS = "herz-jesus-8", "dslr"
 RADIANS = (0.10, 0.15, 0.20, 0.30)
 COLUMNS = ("set", "rad", "seed", "registered", "right", "wrong", "deg", "worst", "dB", "least", "before", "s")
 DB = ("dB", "least_dB", "before_dB")
 WRONG_DEG, AUC_DEG, LEAST_MATCHES = 1.0, 5.0, 30
+FOLDS = 4
 
 
 def show(name: str, **figures: Any) -> None:
@@ -239,28 +243,62 @@ class Bench:
         folder = self.warped(name, radians, seed)
         if folder is None:
             return
-        self.still(name)
-        rec = self._measured[name][0]
-        truth = rs.read_solution(folder / "ground_truth.json")
-        phi_of, of_warp = {image.name: image.motion.phi for image in truth.images}, next(iter(truth.cameras.values()))
-        with tempfile.TemporaryDirectory() as work:
-            loaded, matched = _load_and_match(folder / "photos", Path(work))
-            # each keypoint where the photo as it was showed it
-            still = [
-                _moved(found.xy_raw, of_warp, rs.RowMotion(phi_of[photo]), rs.RowMotion())
-                for photo, found in zip(loaded.names, loaded.features, strict=True)
-            ]
-            features = [replace(found, xy_raw=xy) for found, xy in zip(loaded.features, still, strict=True)]
-            verify_with_shutter(matched)
-            self._show_mapped(name, map_photos(replace(matched, features=features)), radians, seed)
-            tracks = retriangulate(replace(matched, features=features, cameras=rec.cameras), rec)
-        tracks = firmly_connected(tracks)
+        with self._right_matches(name, folder) as (_, matched, rec, phi_of):
+            self._show_mapped(name, map_photos(matched), radians, seed)
+            tracks = firmly_connected(retriangulate(matched, rec))
         obs, phi = tracks.observations, np.array([phi_of[photo] for photo in tracks.image_names])
         xy = obs.xy_raw.copy()
         for f, mine in enumerate(obs.by_photo(len(phi))):
             xy[mine] = _moved(xy[mine], rec.cameras[tracks.camera_idx[f]], rs.RowMotion(), rs.RowMotion(phi[f]))
         tracks = replace(tracks, observations=replace(obs, xy_raw=xy))
         self._show_limit(f"right matches of {name}", name, tracks, phi, radians, seed)
+
+    def search(self, name: str, radians: float, seed: int) -> None:
+        """Motions that a search finds of the photos of one warp, by what the others show."""
+        folder = self.warped(name, radians, seed)
+        if folder is None:
+            return
+        apart, seconds = {}, 0.0
+        with self._right_matches(name, folder) as (loaded, matched, rec, phi_of):
+            tracks = retriangulate(matched, rec)
+            for fold in range(FOLDS):
+                kept = np.arange(tracks.num_images) % FOLDS != fold
+                start = time.perf_counter()
+                found = search_motions(loaded, matched, tracks.take_photos(kept), 1.0, Workers(2), StageLog(None))
+                seconds += time.perf_counter() - start
+                for f in np.flatnonzero(~kept).tolist():
+                    photo, span = tracks.image_names[f], tracks.camera(f).frame_span
+                    phi = found.get(photo, np.full(3, np.nan))
+                    apart[photo] = float(np.linalg.norm(phi - phi_of[photo]) * span)
+        off = np.array([each for each in apart.values() if np.isfinite(each)])
+        show(
+            f"search of {name} by {radians}, seed {seed}", photos=len(apart), found=len(off),
+            median_rad=round(float(np.median(off)), 4), max_rad=round(float(off.max()), 4), seconds=round(seconds, 1),
+            not_found=sorted(photo for photo, each in apart.items() if not np.isfinite(each)),
+        )  # fmt: skip
+        self.rows.append((
+            f"search of {name}", str(radians), str(seed), f"{len(off)}/{len(apart)}", "", "",
+            f"{np.median(off):.4f} rad", f"{off.max():.4f} rad", "", "", "", f"{seconds:.0f}",
+        ))  # fmt: skip
+
+    @contextmanager
+    def _right_matches(
+        self, name: str, folder: Path
+    ) -> Iterator[tuple[LoadedPhotos, MatchedPhotos, rs.Reconstruction, dict[str, np.ndarray]]]:
+        """Photos of a warp, their keypoints where the photos as they were showed them, true poses, and motions."""
+        self.still(name)
+        rec = self._measured[name][0]
+        truth = rs.read_solution(folder / "ground_truth.json")
+        phi_of, of_warp = {image.name: image.motion.phi for image in truth.images}, next(iter(truth.cameras.values()))
+        with tempfile.TemporaryDirectory() as work:
+            loaded, matched = _load_and_match(folder / "photos", Path(work))
+            still = [
+                _moved(found.xy_raw, of_warp, rs.RowMotion(phi_of[photo]), rs.RowMotion())
+                for photo, found in zip(loaded.names, loaded.features, strict=True)
+            ]
+            features = [replace(found, xy_raw=xy) for found, xy in zip(loaded.features, still, strict=True)]
+            verify_with_shutter(matched)
+            yield loaded, replace(matched, features=features, cameras=rec.cameras), rec, phi_of
 
     def _show_mapped(self, name: str, mapped: rs.Reconstruction, radians: float, seed: int) -> None:
         """What mapping makes of the matches of one warp, had it known the motions."""
@@ -537,9 +575,10 @@ def main() -> int:
             for radians in (0.02, *args.rad) if "limit" in args.only else ():
                 for seed in seeds:
                     bench.limit(name, radians, seed)
-            for radians in args.rad if "matches" in args.only else ():
-                for seed in seeds:
-                    bench.matches(name, radians, seed)
+            for part in (bench.matches, bench.search):
+                for radians in args.rad if part.__name__ in args.only else ():
+                    for seed in seeds:
+                        part(name, radians, seed)
         if "fountain" in args.only:
             fountain(bench)
         if "weak" in args.only and args.before is not None:

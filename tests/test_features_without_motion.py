@@ -84,6 +84,11 @@ def solution_of(names, camera):
     )  # fmt: skip
 
 
+def without_motions(other, rec, before):
+    own = {name: rec.camera(i) for i, name in enumerate(rec.image_names)}
+    return other.without_motions(own, dict(zip(rec.image_names, rec.phi, strict=True)), before)
+
+
 @pytest.fixture
 def loaded(tmp_path):
     log = StageLog(None)
@@ -93,7 +98,7 @@ def loaded(tmp_path):
 
 def test_photos_without_a_motion_keep_theirs(loaded):
     photos, other = loaded
-    found = other.without_motions(solution_of(photos.names[:2], photos.cameras.cameras[0]), photos.features)
+    found = without_motions(other, solution_of(photos.names[:2], photos.cameras.cameras[0]), photos.features)
     assert found.features[2] is photos.features[2]
     for old, new in zip(photos.features[:2], found.features[:2], strict=True):
         assert len(new.xy_raw) > 100
@@ -105,13 +110,13 @@ def test_photos_without_a_motion_keep_theirs(loaded):
 def test_those_of_a_fisheye_stay(loaded):
     photos, other = loaded
     fisheye = Camera(960, 720, photos.cameras.cameras[0].K, np.zeros(4), lens="fisheye")
-    found = other.without_motions(solution_of(photos.names, fisheye), photos.features)
+    found = without_motions(other, solution_of(photos.names, fisheye), photos.features)
     assert all(new is old for new, old in zip(found.features, photos.features, strict=True))
 
 
 def test_kinds_stay(loaded):
     photos, other = loaded
-    found = other.without_motions(solution_of(photos.names[:1], photos.cameras.cameras[0]), other.affine().features)
+    found = without_motions(other, solution_of(photos.names[:1], photos.cameras.cameras[0]), other.affine().features)
     assert {*found.features[0].kind.tolist()} == {0, 1}
 
 
@@ -119,7 +124,7 @@ def test_pairs_are_verified_without_motions(loaded, tmp_path):
     photos, _ = loaded
     (tmp_path / "work").mkdir()
     rec = solution_of(photos.names, photos.cameras.cameras[0])
-    matched = match_without_motions(photos, rec, tmp_path / "work", StageLog(None), 0, "auto")
+    matched = match_without_motions(photos, rec, tmp_path / "work", StageLog(None), 0, "auto", {})
     assert matched.cameras == tuple(rec.cameras)
     assert all(one is other for one, other in zip(matched.features, photos.features, strict=True))
     assert matched.database.is_file()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -90,6 +91,22 @@ def test_pairs_that_pycolmap_found_no_geometry_for_are_verified_with_a_shutter(m
 def one_photo(scene, photo):
     rows = scene.observations.by_photo(6)[photo]
     return scene.points_w[scene.observations.point_idx[rows]], np.array(scene.observations.xy_raw[rows])
+
+
+def test_a_photo_is_placed_from_a_rough_motion(rng):
+    # rows that run over a quarter of what a still camera shows; four of five measurements are wrong
+    R_cw, phi = look_at(np.array([-2.0, 0, 0]), np.array([0, 0, 7.0])), np.array([-0.75, 0.3, 0.1])
+    points_w = rng.uniform([-3, -2, 5], [3, 2, 9], (3000, 3))
+    xy, valid = project_points((points_w - [-2, 0, 0]) @ R_cw.T, CAMERA, RowMotion(phi))
+    inside = valid & (np.abs(xy - [600, 450]) < [600, 450]).all(1)
+    points_w, xy = points_w[inside], xy[inside] + rng.normal(0, 0.5, (inside.sum(), 2))
+    wrong = rng.uniform(size=len(xy)) < 0.8
+    xy[wrong] = rng.uniform([0, 0], [1200, 900], (wrong.sum(), 2))
+    blind, placed = place_photo(points_w, xy, CAMERA), place_photo(points_w, xy, CAMERA, phi=phi + 0.1)
+    assert placed.fits[~wrong].all()
+    assert blind.fits.sum() < 0.1 * placed.fits.sum()
+    assert rotated_deg(placed.R_cw, R_cw) < 0.1
+    np.testing.assert_allclose(placed.phi, phi, atol=0.01)
 
 
 @pytest.mark.parametrize("share_wrong", [0.0, 0.4, 0.6])
@@ -403,3 +420,45 @@ def test_other_features_are_taken_if_they_explain_more(scene, matched, rng, tmp_
     assert apart_deg(found.reconstruction, scene).max() < 0.1
     assert not left_out
     assert many.with_features(few.track_source, start, {"9.jpg"}) == (many, start, {"9.jpg"})
+
+
+def test_a_photo_whose_motion_is_found_is_registered(scene, matched):
+    """One that matches nothing as it was taken, but everything without the motion that a search found."""
+    asked = []
+
+    def find(before, known):
+        asked.append((before, known.image_names))
+        return TrackSource(matched, rough_phi={"5.jpg": scene.phi[5] + 0.05})
+
+    pycolmap, nothing = quiet_pycolmap(), matched.database.with_name("nothing.db")
+    shutil.copy(matched.database, nothing)
+    with pycolmap.Database.open(nothing) as db:
+        for first in range(5):
+            db.delete_matches(first + 1, 6)
+            db.delete_two_view_geometry(first + 1, 6)
+    source = TrackSource(replace(matched, database=nothing), with_found_motions=find)
+    registrar = Registrar(source, BundleOptions(), StageLog(lambda *_: None))
+    start = bundle_adjust(scene.take_photos(np.arange(6) < 5), "rotation", rough_options(BundleOptions()))
+    best, found, left_out = registrar.without_motions(start, set())
+    assert asked == [(source.matched, tuple(NAMES[:5]))]
+    assert found.reconstruction.image_names == tuple(NAMES)
+    assert apart_deg(found.reconstruction, scene).max() < 0.1
+    assert best.track_source.matched is matched
+    assert not left_out
+
+
+def test_a_photo_whose_motion_nobody_finds_stays_left_out(scene, matched):
+    source = TrackSource(matched, with_found_motions=lambda *_: None)
+    registrar = Registrar(source, BundleOptions(), StageLog(lambda *_: None))
+    start = bundle_adjust(scene.take_photos(np.arange(6) < 5), "rotation", rough_options(BundleOptions()))
+    assert registrar.without_motions(start, {"5.jpg"}) == (registrar, start, {"5.jpg"})
+
+
+@pytest.mark.parametrize("rad", [0.02])
+def test_motions_of_weak_shutters_are_not_searched(scene, matched):
+    def find(*_):
+        raise AssertionError
+
+    registrar = Registrar(TrackSource(matched, with_found_motions=find), BundleOptions(), StageLog(lambda *_: None))
+    start = bundle_adjust(scene.take_photos(np.arange(6) < 5), "rotation", rough_options(BundleOptions()))
+    assert registrar.without_motions(start, {"5.jpg"}) == (registrar, start, {"5.jpg"})

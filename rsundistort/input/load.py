@@ -19,7 +19,8 @@ from ..io.kept import Kept
 from ..io.outputs import work_folder
 from ..io.photos.images import stored_size, unread_pictures
 from ..io.places import local_place
-from ..model import Camera, Reconstruction, RowMotion
+from ..model import Camera, RowMotion
+from ..model.array_types import Array
 from ..sfm import (
     DETECTION_MEGAPIXELS,
     Features,
@@ -36,7 +37,7 @@ from ..sfm import (
 from .photo_cameras import PhotoCameras, find_cameras
 from .without_motion import FrameWithoutMotion, photo_without_motion
 
-__all__ = ["LONG_EXPOSURE_S", "UNCONNECTED", "LoadedPhotos", "OtherFeatures", "load_photos"]
+__all__ = ["LONG_EXPOSURE_S", "UNCONNECTED", "LoadedPhotos", "OtherFeatures", "load_photos", "reading_bytes"]
 
 #: Longer exposures bound the motion: a camera that rotated much would have blurred the photo.
 LONG_EXPOSURE_S = 1 / 250
@@ -178,8 +179,12 @@ def _bytes_of(job: _LoadJob) -> float:
         return 0.0
     if width * height > job.max_megapixels * 1e6:
         return 0.0
-    per_pixel = _BYTES_PER_PIXEL * (1 if job.motion is None else 2)
-    return detection_bytes(width, height, job.megapixels) + per_pixel * width * height
+    return reading_bytes(width, height, job.megapixels, 1 if job.motion is None else 2)
+
+
+def reading_bytes(width: int, height: int, megapixels: float, copies: int = 1) -> float:
+    """Approximate bytes that a photo takes, with copies of it, and the detection of its features."""
+    return detection_bytes(width, height, megapixels) + copies * _BYTES_PER_PIXEL * width * height
 
 
 def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -> list[str]:
@@ -307,18 +312,26 @@ class OtherFeatures:
         features = self._detect(self._jobs(), "affine features", self.kept, affine=True)
         return self._with("affine features", features, len(features))
 
-    def without_motions(self, rec: Reconstruction, before: Sequence[Features]) -> LoadedPhotos:
-        """Those of registered photos of a reconstruction as they are without lens and rotation, where the photos are.
+    def without_motions(
+        self, own: Mapping[str, Camera], phi: Mapping[str, Array], before: Sequence[Features]
+    ) -> LoadedPhotos:
+        """Those of photos as they are without lens and rotation, where the photos have them.
 
         A strong shutter shears what a feature is described by. Those of the shape of their surroundings are among them
         if they are in `before`. Other photos keep their features before, and so do those of a fisheye, which no pinhole
         camera can show.
+
+        Parameters
+        ----------
+        own, phi : mappings of name to Camera and (3,) array
+            Of the photos whose rotation is taken out.
+        before : sequence of Features
+            Of all photos.
         """
-        index_of = {name: i for i, name in enumerate(rec.image_names) if rec.camera(i).lens != "fisheye"}
         jobs = [
-            replace(job, camera=rec.camera(index_of[job.name]), motion=RowMotion(rec.phi[index_of[job.name]]))
+            replace(job, camera=own[job.name], motion=RowMotion(phi[job.name]))
             for job in self._jobs()
-            if job.name in index_of
+            if job.name in phi and own[job.name].lens != "fisheye"
         ]
         stage, affine = "features without motions", any(each.kind is not None for each in before)
         found = dict(zip([job.name for job in jobs], self._detect(jobs, stage, Kept(), affine=affine), strict=True))

@@ -71,7 +71,9 @@ class Placed:
     fits: Mask
 
 
-def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float = 1.0) -> Placed | None:
+def place_photo(
+    points_w: Array, xy_raw: Array, camera: Camera, step_px: float = 1.0, phi: Array | None = None
+) -> Placed | None:
     """Pose and motion of a photo from points of the scene, many of which may be the wrong ones.
 
     Three points suggest a pose (RANSAC, over the whole frame and over parts of it, in which the shutter moves little);
@@ -86,6 +88,8 @@ def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float =
         Where the photo shows them, pixels.
     step_px : float
         Unit of the thresholds: pixels of this photo to one of the image that the features were found in.
+    phi : (3,) array, optional
+        Rough rotation that the camera had, radians per unit of the clock; by default none.
 
     Returns
     -------
@@ -96,7 +100,7 @@ def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float =
         return None
     every = np.arange(len(points_w))
     few = every if len(every) <= _ENOUGH else np.linspace(0, len(every) - 1, _ENOUGH).astype(np.int64)
-    suggested = _suggested(points_w[few], xy_raw[few], camera, step_px)
+    suggested = _suggested(points_w[few], xy_raw[few], camera, step_px, np.zeros(3) if phi is None else phi)
     found = [_adjusted(pose, points_w[few], xy_raw[few], camera, _WIDE_PX * step_px) for pose in suggested]
     found.sort(key=lambda pose: pose.cost)
     best: Placed | None = None
@@ -120,9 +124,9 @@ class _Pose:
     cost: float = np.inf
 
 
-def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -> Iterator[_Pose]:
+def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float, phi: Array) -> Iterator[_Pose]:
     """Poses by three points each, from the whole frame and from parts along the readout."""
-    ideal, valid = unproject_points(xy_raw, camera, None, "global")
+    ideal, valid = unproject_points(xy_raw, camera, RowMotion(phi), "rotation")
     clock = clock_of(camera, xy_raw)
     borders = np.quantile(clock, np.linspace(0, 1, _PARTS + 1))
     parts = [valid, *(valid & (clock >= low) & (clock <= high) for low, high in pairwise(borders))]
@@ -140,7 +144,7 @@ def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -
             )  # fmt: skip
             if found:
                 R_cw = cv2.Rodrigues(turn)[0]
-                yield _Pose(R_cw, origin - size * (R_cw.T @ way.ravel()))
+                yield _Pose(R_cw, origin - size * (R_cw.T @ way.ravel()), phi)
 
 
 def _adjusted(start: _Pose, points_w: Array, xy_raw: Array, camera: Camera, width: float) -> _Pose:
@@ -204,7 +208,12 @@ class Registration:
 
 
 def register_photos(
-    matched: MatchedPhotos, num_verified: Mapping[tuple[int, int], int], scene: Reconstruction, *, strong: bool = True
+    matched: MatchedPhotos,
+    num_verified: Mapping[tuple[int, int], int],
+    scene: Reconstruction,
+    *,
+    strong: bool = True,
+    rough_phi: Mapping[str, Array] | None = None,
 ) -> Registration:
     """Register photos by what the others show of the scene, each with a motion of its own, where that explains more.
 
@@ -217,6 +226,8 @@ def register_photos(
     strong : bool
         Whether the shutter is so strong that photos may have wrong places: they are then held against these, and those
         of a set that is connected by little against the points of the rest alone. Else only the others are placed.
+    rough_phi : mapping of name to (3,) array, optional
+        Rough rotations of photos that the scene lacks.
 
     Returns
     -------
@@ -247,7 +258,9 @@ def register_photos(
             fits = _fits(scene.R_cw[i], scene.center_w[i], scene.motion(i), points_w, xy, camera, step_px)
             now = len(np.unique(keypoint[fits]))
         enough = max(least, _LEAST_SHARE * total)
-        placed = place_photo(points_w, xy, camera, step_px) if total >= max(enough, _CLEARLY * now) else None
+        placed = None
+        if total >= max(enough, _CLEARLY * now):
+            placed = place_photo(points_w, xy, camera, step_px, (rough_phi or {}).get(name))
         then = 0 if placed is None else len(np.unique(keypoint[placed.fits]))
         if placed is not None and then >= max(enough, _CLEARLY * now):
             if i is None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +33,13 @@ from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
 from ..model import Reconstruction
-from ..sfm import MatchedPhotos, read_num_verified
+from ..sfm import read_num_verified
 from ..verdict import Verdict, judge
 from .outcome import Solved
-from .placing import match_without_motions, place_photos
 from .registering import Registrar, warn_of_left_out
 from .solutions import consistent
 from .survey import Survey
+from .track_sources import TrackSources
 from .tracks import (
     TrackSource,
     adjusted_sequence,
@@ -118,28 +117,10 @@ def solve_photos(
     always_affine : bool
         Whether photos that are left out are reason enough for affine features, without a strong shutter.
     """
-    place = partial(place_photos, log=log, seed=seed, matching=matching, kept=kept or Kept(), with_shutter=True)
-
-    source_of = partial(TrackSource, photos=photos, workers=workers, mapped_here=True)
-
-    def without_motions(before: MatchedPhotos, rec: Reconstruction) -> TrackSource:
-        assert other is not None
-        loaded = other.without_motions(rec, before.features)
-        folder = Path(tempfile.mkdtemp(prefix="without-motions-", dir=scratch))
-        return source_of(match_without_motions(loaded, rec, folder, log, seed, matching))
-
-    @cache
-    def of_affine(is_strong: bool) -> tuple[Reconstruction, TrackSource]:
-        assert other is not None
-        folder = scratch / "affine"
-        folder.mkdir()
-        mapped, matched = place(other.affine(), folder, is_strong=is_strong)
-        return mapped, replace(source_of(matched), without_motions=partial(without_motions, matched))
-
-    mapped, matched = place(photos, scratch, other=other)
+    sources = TrackSources(photos, scratch, seed, log, matching, kept or Kept(), workers, other, always_affine)
+    mapped, source = sources.mapped()
     check_enough(mapped, len(photos.names))
-    num_verified = read_num_verified(matched)
-    source = replace(source_of(matched), of_affine=None if other is None else of_affine, always_affine=always_affine)
+    num_verified = read_num_verified(source.matched)
     solved = solve_tracks(mapped, photos.cameras, shutter_model, seed, options_of, log, remedy, source, survey)
     lost = photos.unregistered(solved.shared.image_names, num_verified)
     solved = replace(solved, unregistered=lost, camera_of=photos.camera_of)

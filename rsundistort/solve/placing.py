@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
-from ..model.array_types import Index
+from ..model.array_types import Array, Index
 from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.database import without_motions
 from ..sfm.mapping import PLACING_KEYPOINTS
@@ -140,7 +141,13 @@ def _match(
 
 
 def match_without_motions(
-    photos: LoadedPhotos, rec: Reconstruction, folder: Path, log: StageLog, seed: int, matching: str
+    photos: LoadedPhotos,
+    rec: Reconstruction,
+    folder: Path,
+    log: StageLog,
+    seed: int,
+    matching: str,
+    rough_phi: Mapping[str, Array],
 ) -> MatchedPhotos:
     """Photos matched again, with pairs verified by keypoints without the motions of a reconstruction of them.
 
@@ -148,10 +155,13 @@ def match_without_motions(
     ----------
     folder : Path
         For the database.
+    rough_phi : mapping of name to (3,) array
+        Rotations of photos that it lacks.
     """
     log.begin("matching without motions")
     idx = photos.cameras.camera_idx
-    own, phi = [rec.cameras[k] for k in idx], np.zeros((len(idx), 3))
+    own = [rec.cameras[k] for k in idx]
+    phi = np.array([rough_phi.get(name, np.zeros(3)) for name in photos.names])
     for i, name in enumerate(rec.image_names):
         k = photos.names.index(name)
         own[k], phi[k] = rec.camera(i), rec.phi[i]

@@ -133,11 +133,34 @@ class Registrar:
         return num_explained(tracks) < num_explained(former)
 
     def without_motions(self, result: BundleResult, left_out: set[str]) -> tuple[Registrar, BundleResult, set[str]]:
-        """The solution by features of the photos without its motions, if these are strong and it is a better one."""
-        detect = self.track_source.without_motions
-        if detect is None or not is_strong(result.reconstruction):
+        """The best solution by features of photos without motions, if these are strong.
+
+        First without the motions found, if it explains more; then also without motions that other photos may have,
+        which match nothing as they were taken, or by which they contradict their places, if more photos are right.
+        """
+        if not is_strong(result.reconstruction):
             return self, result, left_out
-        return self.with_features(detect(result.reconstruction), result, left_out)
+        best, detect = self, self.track_source.without_motions
+        if detect is not None:
+            best, result, left_out = self.with_features(detect(result.reconstruction), result, left_out)
+        return best._with_found_motions(result, left_out)
+
+    def _with_found_motions(self, result: BundleResult, left_out: set[str]) -> tuple[Registrar, BundleResult, set[str]]:
+        matched, find = self.track_source.matched, self.track_source.with_found_motions
+        suspects = self.suspects(result.reconstruction)
+        num_right = result.reconstruction.num_images - len(suspects)
+        if find is None or num_right == len(matched.names):
+            return self, result, left_out
+        scene = self._new_tracks(result.reconstruction)
+        scene = scene.take_photos(~np.isin(scene.image_names, suspects))
+        source = find(matched, scene) if scene.num_images >= LEAST_PHOTOS else None
+        if source is None:
+            return self, result, left_out
+        best, found, found_left_out = self.with_features(source, result, left_out)
+        if found.reconstruction.num_images - len(best.suspects(found.reconstruction)) <= num_right:
+            return self, result, left_out
+        # what they show may be what others lacked
+        return best._with_found_motions(found, found_left_out)
 
     def with_features(
         self, source: TrackSource, result: BundleResult, left_out: set[str]
@@ -199,7 +222,8 @@ class Registrar:
             whole = scene
             if taken:
                 scene = firmly_connected(scene.take_photos(~wrong))
-            found = register_photos(matched, self._num_verified, scene, strong=strong)
+            rough_phi = self.track_source.rough_phi
+            found = register_photos(matched, self._num_verified, scene, strong=strong, rough_phi=rough_phi)
             if gone := {*rec.image_names}.difference(scene.image_names).union(found.dropped):
                 lost.note(whole if whole.num_images == rec.num_images else rec, gone)
             elif not found.changes and wave < _MOST_WAVES:  # the next one judges them

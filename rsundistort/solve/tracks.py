@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -16,6 +16,7 @@ from ..errors import ReconstructionError, RsUndistortWarning
 from ..input.load import LoadedPhotos
 from ..input.patches import patch_source
 from ..model import Reconstruction
+from ..model.array_types import Array
 from ..model.projection import unproject_points
 from ..sfm import MatchedPhotos, align_tracks, firmly_connected, retriangulate
 from .depth_reversal import choose_depths
@@ -67,6 +68,11 @@ class TrackSource:
         None if there are none.
     without_motions : callable or None
         Gives the source of features of the photos without the motions of a reconstruction; None if there are none.
+    with_found_motions : callable or None
+        Gives the source with features of photos that a scene of it lacks, without motions that they are found to have;
+        None, or none, if there are none.
+    rough_phi : mapping of name to (3,) array
+        These motions, radians per unit of the clock.
     always_affine : bool
         Whether one photo that is left out is reason enough for these.
     """
@@ -77,6 +83,8 @@ class TrackSource:
     mapped_here: bool = False
     of_affine: Callable[[bool], tuple[Reconstruction, TrackSource]] | None = None
     without_motions: Callable[[Reconstruction], TrackSource] | None = None
+    with_found_motions: Callable[[MatchedPhotos, Reconstruction], TrackSource | None] | None = None
+    rough_phi: Mapping[str, Array] = field(default_factory=dict)
     always_affine: bool = False
 
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:

@@ -1,0 +1,97 @@
+"""Motions of photos that match nothing as they were taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plane_photos import CAMERA, SIZE, texture, views, write
+
+from rsundistort import Camera, Observations, Reconstruction, RowMotion, undistort_points
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.errors import FileError
+from rsundistort.input.load import load_photos
+from rsundistort.input.motion_search import search_motions, tried_motions
+from rsundistort.sfm import MatchedPhotos
+from rsundistort.sfm.descriptor_matches import DescriptorIndex, match_descriptors
+from rsundistort.synthetic import warp_photo
+
+SHIFT_PX, F_PX = 40, 800.0
+PINHOLE = Camera(*SIZE, [[F_PX, 0, SIZE[0] / 2], [0, F_PX, SIZE[1] / 2], [0, 0, 1]])
+# rows that run over three tenths of what a still camera shows, and are sheared by as much
+PHI = np.array([-0.7, 0.3, 0.1])
+
+
+@pytest.mark.parametrize("readout", ["top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left"])
+def test_rows_are_stretched_and_sheared(readout):
+    camera = replace(PINHOLE, readout=readout)
+    along = camera.clock_axis
+    center = camera.K[:2, 2]
+    xy = np.array([center, center + np.eye(2)[along]])
+    seen = []
+    for phi in tried_motions(camera):
+        for each in phi:
+            ideal = undistort_points(xy, camera, RowMotion(each), P=camera.K)
+            seen.append((ideal[1] - ideal[0])[[along, 1 - along]])
+    stretch, shear = np.array(seen).T
+    assert np.allclose(np.exp(np.round(2 * np.log(stretch)) / 2), stretch, rtol=2e-3)
+    for each in np.unique(np.round(2 * np.log(stretch))):
+        mine = np.sort(shear[np.round(2 * np.log(stretch)) == each])
+        np.testing.assert_allclose(mine, -mine[::-1], atol=2e-3)
+        np.testing.assert_allclose(np.diff(mine), 0.5 * np.exp(each / 2), rtol=0.02)
+        assert 0.5 < mine.max() < 1.001
+    assert (np.abs(stretch - 1.0) + np.abs(shear) < 2e-3).sum() == 1
+
+
+@pytest.fixture
+def plane(tmp_path):
+    """Two photos of a plane at the distance 1 in a scene, and a third one that a strong shutter read."""
+    still = views(texture(0, 3.0), shift=SHIFT_PX)
+    folder = write(tmp_path / "in", [*still[:2], warp_photo(still[2], PINHOLE, RowMotion(PHI))[0]])
+    photos = load_photos(folder, CAMERA, "top-to-bottom", 4000, Workers(2), StageLog(None))
+    features = photos.features
+    found = match_descriptors(*(DescriptorIndex.of(each.descriptors) for each in features[:2]))
+    xy = [each.xy_raw[mine] for each, mine in zip(features[:2], found.T, strict=True)]
+    points_w = np.column_stack([(xy[0] - PINHOLE.K[:2, 2]) / F_PX, np.ones(len(found))])
+    center_w = np.array([[0, 0, 0], [SHIFT_PX / F_PX, SHIFT_PX / F_PX, 0]])
+    observations = Observations(
+        np.repeat([0, 1], len(found)), np.tile(np.arange(len(found)), 2), np.concatenate(xy)
+    )  # fmt: skip
+    scene = Reconstruction(
+        [PINHOLE], photos.names[:2], np.zeros(2, int), np.tile(np.eye(3), (2, 1, 1)), center_w, points_w, observations,
+        shutter_model="rotation",
+    )  # fmt: skip
+    matched = MatchedPhotos(tmp_path / "none.db", photos.names, features, [PINHOLE], np.zeros(3, int), True, 0)
+    return photos, matched, scene
+
+
+def test_a_motion_is_found_by_what_a_photo_shows_without_it(plane):
+    said = []
+    photos, matched, scene = plane
+    for workers in (Workers(1), Workers(2)):
+        found = search_motions(photos, matched, scene, 1.0, workers, StageLog(lambda *each: said.append(each)))
+        assert list(found) == ["2.png"]
+        np.testing.assert_allclose(found["2.png"], PHI, atol=0.02)
+    assert said[0] == said[7] == ("search for motions", 0, 6)
+    assert said[6] == said[-1] == ("search for motions", 6, 6)
+
+
+def test_photos_of_a_fisheye_and_other_scenes_are_passed_over(plane):
+    photos, matched, scene = plane
+    fisheye = replace(scene, cameras=[Camera(*SIZE, PINHOLE.K, np.zeros(4), lens="fisheye")])
+    assert search_motions(photos, matched, fisheye, 1.0, Workers(1), StageLog(None)) == {}
+    cut = replace(scene, points_w=scene.points_w + np.array([0, 0, 9.0]))
+    one = replace(photos, names=[*photos.names, "3.png", "4.png"])
+    more = replace(
+        matched, names=one.names, features=[*matched.features, *matched.features[:2]], camera_idx=np.zeros(5, int)
+    )
+    assert search_motions(one, more, cut, 1.0, Workers(1), StageLog(None)) == {}
+
+
+def test_a_photo_that_went_away_is_named(plane):
+    photos, matched, scene = plane
+    (photos.folder / "2.png").unlink()
+    with pytest.raises(FileError, match=r"2\.png"):
+        search_motions(photos, matched, scene, 1.0, Workers(1), StageLog(None))
