@@ -148,6 +148,13 @@ def by_affine_features(num_registered, num_found, total=6, *, can=True, strong=T
     return None if found is None else found.shared.num_images
 
 
+@pytest.fixture
+def of_one_scale(monkeypatch):
+    """All photos are."""
+    monkeypatch.setattr(model_sequence, "num_of_one_scale", lambda rec: rec.num_images)
+
+
+@pytest.mark.usefixtures("of_one_scale")
 def test_a_solution_by_them_is_taken_if_it_has_more_photos():
     assert by_affine_features(4, 5) == 5
     assert by_affine_features(4, 4) is None
@@ -155,6 +162,7 @@ def test_a_solution_by_them_is_taken_if_it_has_more_photos():
     assert by_affine_features(4, 5, can=False) is None
 
 
+@pytest.mark.usefixtures("of_one_scale")
 def test_nobody_pays_for_them_who_hardly_needs_them():
     assert by_affine_features(6, 7) is None
     assert by_affine_features(91, 100, total=100) is None
@@ -162,6 +170,7 @@ def test_nobody_pays_for_them_who_hardly_needs_them():
     assert by_affine_features(4, 5, strong=False) is None
 
 
+@pytest.mark.usefixtures("of_one_scale")
 def test_one_photo_is_reason_enough_where_that_is_wanted(monkeypatch):
     monkeypatch.setattr(model_sequence, "consistent", lambda *_: True)
     for strong in (False, True):
@@ -169,6 +178,13 @@ def test_one_photo_is_reason_enough_where_that_is_wanted(monkeypatch):
         assert by_affine_features(100, 100, total=100, strong=strong, always=True) is None
 
 
+def test_photos_that_could_be_scaled_have_no_place(monkeypatch):
+    monkeypatch.setattr(model_sequence, "num_of_one_scale", lambda rec: rec.num_images // 2)
+    assert by_affine_features(6, 6) is None
+    assert by_affine_features(4, 6) == 6
+
+
+@pytest.mark.usefixtures("of_one_scale")
 def test_places_without_a_strong_shutter_must_stay(monkeypatch):
     monkeypatch.setattr(model_sequence, "consistent", lambda *_: False)
     assert by_affine_features(4, 5, strong=False, always=True) is None

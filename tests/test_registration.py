@@ -25,7 +25,7 @@ from rsundistort.sfm.sides import carried_along
 from rsundistort.sfm.verification import pair_of
 from rsundistort.solve import registering
 from rsundistort.solve.registering import Registrar
-from rsundistort.solve.solutions import agree, consistent, num_explained, photos_apart
+from rsundistort.solve.solutions import agree, consistent, num_explained, num_of_one_scale, photos_apart
 from rsundistort.solve.tracks import TrackSource, rough_options
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
@@ -316,8 +316,8 @@ def test_a_side_without_a_photo_in_the_scene_or_a_scale_stays_out(scene):
 
 @pytest.mark.parametrize("rad", [0.02])
 def test_a_side_of_which_one_photo_alone_can_be_registered_follows_it(scene, matched, monkeypatch):
-    def but_for_the_last(matched, num_verified, scene, *, strong):
-        found = register_photos(matched, num_verified, scene, strong=strong)
+    def but_for_the_last(matched, num_verified, scene, **options):
+        found = register_photos(matched, num_verified, scene, **options)
         new = np.isin(found.reconstruction.image_names, scene.image_names)
         new |= np.array(found.reconstruction.image_names) != "5.jpg"
         return replace(
@@ -403,6 +403,14 @@ def test_solutions_are_consistent_in_any_frame_and_scale_but_not_with_a_side_of_
     off[2] = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix() @ off[2]
     assert not consistent(scene, replace(scene, R_cw=off))
     assert not consistent(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))
+
+
+def test_parts_that_share_one_photo_have_no_common_scale(scene):
+    assert num_of_one_scale(scene) == 6
+    # some points only the first four photos show, the others only the last three
+    frame, point = scene.observations.frame_idx, scene.observations.point_idx
+    shown = np.where(point % 2 == 0, frame <= 3, frame >= 3)
+    assert num_of_one_scale(replace(scene, observations=scene.observations.select(shown))) == 4
 
 
 @pytest.mark.parametrize("rad", [0.02])

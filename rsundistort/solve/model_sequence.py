@@ -37,7 +37,7 @@ from ..sfm import read_num_verified
 from ..verdict import Verdict, judge
 from .outcome import Solved
 from .registering import Registrar, warn_of_left_out
-from .solutions import consistent
+from .solutions import consistent, num_of_one_scale
 from .survey import Survey
 from .track_sources import TrackSources
 from .tracks import (
@@ -53,7 +53,7 @@ from .tracks import (
 
 __all__ = ["solve_photos", "solve_tracks", "without_shutter"]
 
-# Share of the photos that are left out from which on features of all are detected once more.
+# Share of the photos that have no place from which on features of all are detected once more.
 _WORTH = 0.1
 # Where a shutter was not found, the principal point without one is not farther than this share of the frame from that
 # with one, if both are the lens's: stabilised lenses move it by a few hundredths.
@@ -216,21 +216,23 @@ def solve_tracks(
 def _by_affine_features(
     track_source: TrackSource, result: BundleResult, solve: Callable[..., Solved], strong: bool
 ) -> Solved | None:
-    """The solution of features that strong shutters leave as they are, if it has photos that are not registered.
+    """The solution of features that strong shutters leave as they are, if more photos have a place in it.
+
+    A photo that is not registered has none, nor has one of a part that could be scaled against the rest.
 
     Without a strong shutter nothing speaks against the places that photos have, and those of the other must be the
     same: a photo that few points connect may scale a part of the scene.
     """
-    total, num_registered = len(track_source.matched.names), result.reconstruction.num_images
+    total, num_placed = len(track_source.matched.names), num_of_one_scale(result.reconstruction)
     solved: Solved | None = None
     least = 1 if track_source.always_affine else max(_WORTH * total, 1) if strong else np.inf
-    if track_source.of_affine is None or total - num_registered < least:
+    if track_source.of_affine is None or total - num_placed < least:
         return None
     # what is said of a solution that is not taken concerns nobody
     with suppress(ReconstructionError), warnings.catch_warnings(record=True) as said:
         mapped, source = track_source.of_affine(strong)
         solved = solve(mapped, track_source=source)
-    if solved is None or solved.shared.num_images <= num_registered:
+    if solved is None or num_of_one_scale(solved.shared) <= num_placed:
         return None
     if not (strong or consistent(result.reconstruction, solved.shared)):
         return None

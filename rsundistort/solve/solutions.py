@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
 from ..model.similarity import similarity_of
-from ..sfm import SIFT_PX
+from ..sfm import LEAST_TIES, SIFT_PX, connected_photos
 
-__all__ = ["agree", "consistent", "num_explained", "photos_apart", "same_places"]
+__all__ = ["agree", "consistent", "num_explained", "num_of_one_scale", "photos_apart", "same_places"]
 
 # Of the noise of features: farther from its prediction no measurement is explained.
 _MOST_SIGMAS = 3.0
@@ -31,6 +31,11 @@ def num_explained(reconstruction: Reconstruction, without: Collection[str] = ())
     within = _MOST_SIGMAS * SIFT_PX * rec.observations.sigma
     counts = ~np.isin(rec.image_names, [*without])[rec.observations.frame_idx]
     return int((counts & valid & (np.linalg.norm(residuals, axis=1) <= within)).sum())
+
+
+def num_of_one_scale(reconstruction: Reconstruction) -> int:
+    """Photos of the largest part of which nothing could be scaled against the rest."""
+    return int(connected_photos(reconstruction, LEAST_TIES, in_common=2).sum())
 
 
 def agree(rec: Reconstruction, other: Reconstruction) -> bool:
