@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from plane_photos import CAMERA, SIZE, texture, views, write
@@ -12,6 +13,7 @@ from rsundistort import Camera, Observations, Reconstruction, RowMotion, undisto
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.errors import FileError
+from rsundistort.input import motion_search
 from rsundistort.input.load import load_photos
 from rsundistort.input.motion_search import search_motions, tried_motions
 from rsundistort.sfm import MatchedPhotos
@@ -69,27 +71,50 @@ def plane(tmp_path):
 
 def test_a_motion_is_found_by_what_a_photo_shows_without_it(plane):
     said = []
-    photos, matched, scene = plane
-    for workers in (Workers(1), Workers(2)):
-        found = search_motions(photos, matched, scene, 1.0, workers, StageLog(lambda *each: said.append(each)))
-        assert list(found) == ["2.png"]
-        np.testing.assert_allclose(found["2.png"], PHI, atol=0.02)
-    assert said[0] == said[7] == ("search for motions", 0, 6)
-    assert said[6] == said[-1] == ("search for motions", 6, 6)
+    found = search_motions(*plane, 1.0, Workers(2), StageLog(lambda *each: said.append(each)))
+    assert list(found) == ["2.png"]
+    np.testing.assert_allclose(found["2.png"], PHI, atol=0.02)
+    assert said[0] == ("search for motions", 0, 6)
+    assert said[-1] == ("search for motions", 6, 6)
 
 
-def test_photos_of_a_fisheye_and_other_scenes_are_passed_over(plane):
+@pytest.fixture
+def few_trials(monkeypatch):
+    """Only what leads to the motion is tried."""
+    tried = [np.zeros((0, 3)), np.zeros((0, 3)), PHI[None] + 0.05, *[np.zeros((0, 3))] * 3]
+    monkeypatch.setattr(motion_search, "tried_motions", lambda _: tried)
+
+
+@pytest.mark.usefixtures("few_trials")
+def test_the_number_of_threads_changes_nothing(plane):
+    one, two = (search_motions(*plane, 1.0, Workers(jobs), StageLog(None)) for jobs in (1, 2))
+    np.testing.assert_array_equal(one["2.png"], two["2.png"])
+    np.testing.assert_allclose(one["2.png"], PHI, atol=0.02)
+
+
+def test_photos_of_a_fisheye_are_passed_over(plane):
     photos, matched, scene = plane
     fisheye = replace(scene, cameras=[Camera(*SIZE, PINHOLE.K, np.zeros(4), lens="fisheye")])
     assert search_motions(photos, matched, fisheye, 1.0, Workers(1), StageLog(None)) == {}
-    cut = replace(scene, points_w=scene.points_w + np.array([0, 0, 9.0]))
-    one = replace(photos, names=[*photos.names, "3.png", "4.png"])
-    more = replace(
-        matched, names=one.names, features=[*matched.features, *matched.features[:2]], camera_idx=np.zeros(5, int)
-    )
-    assert search_motions(one, more, cut, 1.0, Workers(1), StageLog(None)) == {}
 
 
+@pytest.mark.usefixtures("few_trials")
+@pytest.mark.parametrize("first", ["2.png", "3.png"])
+def test_the_search_ends_where_photos_show_another_scene(plane, monkeypatch, first):
+    photos, matched, scene = plane
+    monkeypatch.setattr(motion_search, "_PHOTOS_AT_ONCE", 1)
+    cv2.imwrite(str(photos.folder / "3.png"), texture(9, 3.0)[: SIZE[1], : SIZE[0]])
+    names = [*photos.names[:2], first, "2.png" if first == "3.png" else "3.png"]
+    more = replace(photos, names=names)
+    idx, features = np.zeros(4, int), [*matched.features, matched.features[2]]
+    asked = replace(matched, names=names, camera_idx=idx, features=features)
+    said = []
+    found = search_motions(more, asked, scene, 1.0, Workers(1), StageLog(lambda *each: said.append(each)))
+    assert list(found) == (["2.png"] if first == "2.png" else [])
+    assert said[-1][1:] == ((12, 12) if first == "2.png" else (6, 12))
+
+
+@pytest.mark.usefixtures("few_trials")
 def test_a_photo_that_went_away_is_named(plane):
     photos, matched, scene = plane
     (photos.folder / "2.png").unlink()

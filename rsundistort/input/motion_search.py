@@ -36,6 +36,8 @@ _STEP, _STRETCHES, _LARGEST_SHEAR = 0.5, np.exp(0.5 * np.arange(-4, 2)), 1.0
 _MEGAPIXELS, _MAX_FEATURES = 0.3, 8192
 # Registered photos that are asked, those next to a photo in the order of names.
 _ASKED = 32
+# Photos that are searched before it is decided whether it is worth going on.
+_PHOTOS_AT_ONCE = 16
 # Measurements that fit, from which on a motion is worth features of its own, which decide: wrong ones have 4 to 6.
 _LEAST = 8
 
@@ -109,6 +111,8 @@ def search_motions(
 ) -> dict[str, Array]:
     """Rough rotations phi (3,) of photos that a scene lacks, of those that show points of it without their rotation.
 
+    Many photos that are lacking may show another scene: if of some none is found, the search ends.
+
     Parameters
     ----------
     matched : MatchedPhotos
@@ -122,33 +126,39 @@ def search_motions(
         k for k, name in enumerate(photos.names)
         if name not in scene.image_names and scene.cameras[matched.camera_idx[k]].lens != "fisheye"
     ]  # fmt: skip
-    if not asked or len(asked) > scene.num_images:  # most of them show another scene, rather
+    if not asked:
         return {}
-    shown = _shown_by_photos(matched, scene)
+    shown, motions, stage = _shown_by_photos(matched, scene), dict[str, Array](), "search for motions"
     trials = []
     for k in asked:
         name, camera = photos.names[k], scene.cameras[matched.camera_idx[k]]
         near = sorted(shown, key=lambda other: (abs(other - k), other))[:_ASKED]
         of_photo = _Shown(scene.points_w, [shown[other] for other in near])
-        for stretch, phi in zip(_STRETCHES, tried_motions(camera), strict=True):
-            size = min(_MEGAPIXELS / stretch, megapixels)
-            where = photos.folder / name, photos.mask_of.get(name), photos.max_megapixels
-            trials.append(_Trial(name, *where, size, camera, phi, of_photo))
-    log.begin("search for motions", len(trials))
-    best: dict[str, _Best] = {}
+        where = photos.folder / name, photos.mask_of.get(name), photos.max_megapixels
+        trials += [
+            _Trial(name, *where, min(_MEGAPIXELS / stretch, megapixels), camera, phi, of_photo)
+            for stretch, phi in zip(_STRETCHES, tried_motions(camera), strict=True)
+        ]
     if not workers.scheduler:
         sizes = (reading_bytes(each.camera.width, each.camera.height, each.megapixels) for each in trials)
         workers = workers.fitting("features", max(sizes))
-    results = workers.map(_try, trials, lambda trial, why: _Best(np.zeros(3), problem=f"{trial.name}: {why}"))
-    with closing(results):
-        for done, (trial, found) in enumerate(zip(trials, results, strict=True), 1):
-            if found.problem:
-                raise FileError(found.problem)
-            if found.num_fitting > best.get(trial.name, _Best(np.zeros(3))).num_fitting:
-                best[trial.name] = found
-            log.tell("search for motions", done, len(trials))
-    motions = {name: each.phi for name, each in best.items() if each.num_fitting >= _LEAST}
-    log.end("search for motions", photos=len(asked), found=sorted(motions))
+    log.begin(stage, len(trials))
+    at_once = _PHOTOS_AT_ONCE * len(_STRETCHES)
+    for start in range(0, len(trials), at_once):
+        best: dict[str, _Best] = {}
+        some = trials[start : start + at_once]
+        results = workers.map(_try, some, lambda trial, why: _Best(np.zeros(3), problem=f"{trial.name}: {why}"))
+        with closing(results):
+            for done, (trial, found) in enumerate(zip(some, results, strict=True), start + 1):
+                if found.problem:
+                    raise FileError(found.problem)
+                if found.num_fitting > best.get(trial.name, _Best(np.zeros(3))).num_fitting:
+                    best[trial.name] = found
+                log.tell(stage, done, len(trials))
+        motions |= {name: each.phi for name, each in best.items() if each.num_fitting >= _LEAST}
+        if motions.keys().isdisjoint(best):  # the others show another scene, rather
+            break
+    log.end(stage, photos=len(asked), found=sorted(motions))
     return motions
 
 
