@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from plane_photos import CAMERA, texture, views, write
@@ -9,6 +10,7 @@ from plane_photos import CAMERA, texture, views, write
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, distort_points, undistort_points
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
+from rsundistort.errors import InputError
 from rsundistort.input.load import OtherFeatures, load_photos
 from rsundistort.input.without_motion import photo_without_motion
 from rsundistort.sfm import detect_features
@@ -128,3 +130,31 @@ def test_pairs_are_verified_without_motions(loaded, tmp_path):
     assert matched.cameras == tuple(rec.cameras)
     assert all(one is other for one, other in zip(matched.features, photos.features, strict=True))
     assert matched.database.is_file()
+
+
+def test_photos_whose_masks_exclude_all_of_them_are_named(tmp_path):
+    folder = write(tmp_path / "in", views(texture(0)))
+    (tmp_path / "masks").mkdir()
+
+    def load(black):
+        for name in ("0.png", "1.png", "2.png"):
+            mask = np.full((720, 960), 0 if name in black else 255, np.uint8)
+            cv2.imwrite(str(tmp_path / "masks" / name), mask)
+        return load_photos(
+            folder, CAMERA, "top-to-bottom", 1000, Workers(2), StageLog(None), megapixels=0.1, masks=tmp_path / "masks"
+        )
+
+    photos = load(["1.png"])
+    assert photos.unregistered(["0.png"]) == {
+        "1.png": "its mask excludes all that it shows", "2.png": "shares too little with the other photos",
+    }  # fmt: skip
+    with pytest.raises(InputError, match=r"no photo in .* shows a feature \(0\.png: its mask excludes all"):
+        load(["0.png", "1.png", "2.png"])
+
+
+def test_frames_stay_within_what_can_be_rectified():
+    """A photo that is nearly as wide as OpenCV takes it."""
+    camera = Camera(32700, 20, [[30000, 0, 16350], [0, 30000, 10], [0, 0, 1]])
+    pixels = np.zeros((20, 32700), np.uint8)
+    frame = photo_without_motion(pixels, None, camera, RowMotion(np.array([0.0, 100.0, 0.0])), 1.0)[2]
+    assert 32700 < frame.target.width <= 32766

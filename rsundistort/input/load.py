@@ -98,11 +98,21 @@ class LoadedPhotos:
         """Index of the camera of each photo."""
         return dict(zip(self.names, self.cameras.camera_idx.tolist(), strict=True))
 
+    @property
+    def featureless(self) -> dict[str, str]:
+        """Photos without a feature, and why."""
+        return {
+            name: "its mask excludes all that it shows" if name in self.mask_of else "shows no features"
+            for name, found in zip(self.names, self.features, strict=True)
+            if not len(found.xy_raw)
+        }
+
     def unregistered(
         self, registered: Sequence[str], num_verified: Mapping[tuple[int, int], int] | None = None
     ) -> dict[str, str]:
         """Photos that are not registered, and why; with the number of verified matches of each pair, if it is known."""
         lost = dict.fromkeys(sorted({*self.names} - {*registered}), UNCONNECTED)
+        lost |= {name: why for name, why in self.featureless.items() if name in lost}
         for scene in other_scenes(num_verified or {}, np.isin(self.names, registered)):
             why = f"shows another scene, with {len(scene) - 1} other photos; put them in a folder of their own"
             lost |= dict.fromkeys((self.names[i] for i in scene), why)
@@ -267,10 +277,13 @@ def load_photos(
     cameras = find_cameras(folder, names, [(each.width, each.height) for each in loaded], facts, camera, readout)
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
     orientations = {name: each.orientation for name, each in found.items()}
-    return LoadedPhotos(
+    photos = LoadedPhotos(
         names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, max_megapixels,
         [each.edge_px for each in loaded], frozenset(name for name, each in found.items() if each.coarse),
     )  # fmt: skip
+    if len(photos.featureless) == len(names):
+        raise InputError(f"no photo in {folder} shows a feature ({names[0]}: {photos.featureless[names[0]]})")
+    return photos
 
 
 @dataclass(frozen=True)

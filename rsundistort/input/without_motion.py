@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..model import Camera, RowMotion
 from ..model.array_types import Array
 from ..rectify import distort_points, rectify, undistort_points
+from ..rectify.photo import MAX_SIDE
 from ..sfm import Features
 
 __all__ = ["FrameWithoutMotion", "photo_without_motion"]
@@ -79,7 +80,7 @@ def _whole(camera: Camera, motion: RowMotion) -> Camera:
     x, y = np.meshgrid(*(np.linspace(0, side - 1, _SAMPLES) for side in size))
     xy: Array = undistort_points(np.column_stack([x.ravel(), y.ravel()]), camera, motion, P=camera.K)
     xy = xy[np.isfinite(xy).all(axis=1)]
-    most = 0.5 * (_MOST - 1.0) * size
+    most = 0.5 * np.minimum((_MOST - 1.0) * size, MAX_SIDE - size)
     low = np.floor(np.clip(xy.min(axis=0), -most, 0.0))
     high = np.ceil(np.clip(xy.max(axis=0), size - 1.0, size - 1.0 + most))
     K = camera.K.copy()
