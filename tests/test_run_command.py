@@ -179,7 +179,7 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_with_camera(","), "expected a file or fx,fy,cx,cy"),
         pytest.param(_with_camera(",".join(["1"] * 300)), "expected a file or fx,fy,cx,cy"),
         (_apart, "share more of the scene"),
-        (_flat, "share more of the scene"),
+        (_flat, "no photo shows a feature (a.png: shows no features); use photos of things with texture"),
         (_still, "nobody.png"),
         (_tiny_scale, "scale=0.001 leaves 0x0 pixels"),
         (_two_camera_files, "holds camera.json and cameras.json; remove one"),

@@ -282,7 +282,8 @@ def load_photos(
         [each.edge_px for each in loaded], frozenset(name for name, each in found.items() if each.coarse),
     )  # fmt: skip
     if len(photos.featureless) == len(names):
-        raise InputError(f"no photo in {folder} shows a feature ({names[0]}: {photos.featureless[names[0]]})")
+        better = "masks that are black in fewer places" if mask_of else "photos of things with texture"
+        raise InputError(f"no photo shows a feature ({names[0]}: {photos.featureless[names[0]]}); use {better}")
     return photos
 
 
