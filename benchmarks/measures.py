@@ -24,6 +24,7 @@ from rsundistort import (
     SolvedImage,
     SolveOptions,
     init_rectify_map,
+    project_points,
     read_solution,
     rectify,
     unproject_points,
@@ -358,3 +359,24 @@ def with_drawn_errors(cameras: dict[str, Any], seed: int) -> dict[str, Any]:
         given = moved_camera(camera, names, np.array([*off.values()]))
         each |= {"K": given.K.tolist(), "dist": given.dist.tolist()}
     return content
+
+
+def moved_photo(
+    pixels: np.ndarray, depth: np.ndarray, camera: Camera, motion: RowMotion, steps: int = 30
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a rolling shutter makes of a photo, and where it is known: each pixel is looked for by fixed point."""
+    height, width = depth.shape
+    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=2).reshape(-1, 2).astype(float)
+    ideal, _ = unproject_points(xy, camera, None, "global")
+    points = np.column_stack([ideal, np.ones(len(ideal))]) * depth.reshape(-1, 1)
+    seen, valid = project_points(points, camera, motion, "constant-motion")
+    shift = np.where((valid & np.isfinite(depth.ravel()))[:, None], seen - xy, np.nan)
+    shift = shift.reshape(height, width, 2).astype(np.float32)
+    target = xy.reshape(height, width, 2).astype(np.float32)
+    source = target.copy()
+    for _ in range(steps):
+        found = cv2.remap(shift, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderValue=(np.nan, np.nan))
+        source = target - np.nan_to_num(found)
+    found = cv2.remap(shift, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderValue=(np.nan, np.nan))
+    known = (np.abs(source + found - target) < 0.05).all(axis=2)
+    return cv2.remap(pixels, source[..., 0], source[..., 1], cv2.INTER_LANCZOS4), known

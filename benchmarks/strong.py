@@ -53,7 +53,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
-from measures import fountain_truth, run_options, with_lens_of
+from measures import fountain_truth, moved_photo, run_options, with_lens_of
 from scipy.spatial.transform import Rotation
 
 import rsundistort as rs
@@ -86,8 +86,7 @@ from rsundistort.solve.run_outputs import Outputs
 ROOT = Path(__file__).resolve().parent.parent
 # RANSAC draws at random: areas of others are means of so many draws.
 DRAWS = 6
-PARTS = "sets", "pairs", "limit", "matches", "search", "fountain", "weak"
-SETS = "herz-jesus-8", "dslr"
+PARTS, SETS = ("sets", "pairs", "limit", "matches", "search", "fountain", "weak"), ("herz-jesus-8", "dslr")
 RADIANS = (0.10, 0.15, 0.20, 0.30)
 COLUMNS = ("set", "rad", "seed", "registered", "right", "wrong", "deg", "worst", "dB", "least", "before", "s")
 DB = ("dB", "least_dB", "before_dB")
@@ -273,15 +272,16 @@ class Bench:
                 start, phi = time.perf_counter(), find().get(photo, np.full(3, np.nan))
                 seconds += time.perf_counter() - start
                 apart[photo] = float(np.linalg.norm(phi - phi_of[photo]) * tracks.camera(f).frame_span)
-                true = [phi_of[photo][None], *[np.zeros((0, 3))] * 5]
+                others = motion_search.tried_motions(tracks.camera(f))[1:]
+                true = [phi_of[photo][None], *(each[:0] for each in others)]
                 with mock.patch.object(motion_search, "tried_motions", lambda _, true=true: true):
                     hidden += [] if find() else [photo]
         off = np.array([each for each in apart.values() if np.isfinite(each)])
+        lost = sorted(photo for photo, each in apart.items() if not np.isfinite(each))
         show(
             f"search of {name} by {radians}, seed {seed}", photos=len(apart), found=len(off),
             median_rad=round(float(np.median(off)), 4), max_rad=round(float(off.max()), 4), seconds=round(seconds, 1),
-            not_found=sorted(photo for photo, each in apart.items() if not np.isfinite(each)),
-            not_by_true_motions=hidden,
+            not_found=lost, not_by_true_motions=hidden,
         )  # fmt: skip
         self.rows.append((
             f"search of {name}", str(radians), str(seed), f"{len(off)}/{len(apart)}", "", "",
@@ -470,27 +470,6 @@ def _error(found: tuple[np.ndarray, np.ndarray] | None, truth: tuple[np.ndarray,
 def _auc(errors: list[float]) -> float:
     """Area under the curve of the share of pairs within an error, up to AUC_DEG, as a share."""
     return float(np.mean(np.maximum(AUC_DEG - np.array(errors), 0.0)) / AUC_DEG)
-
-
-def moved_photo(
-    pixels: np.ndarray, depth: np.ndarray, camera: rs.Camera, motion: rs.RowMotion, steps: int = 30
-) -> tuple[np.ndarray, np.ndarray]:
-    """What a rolling shutter makes of a photo, and where it is known: each pixel is looked for by fixed point."""
-    height, width = depth.shape
-    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=2).reshape(-1, 2).astype(float)
-    ideal, _ = rs.unproject_points(xy, camera, None, "global")
-    points = np.column_stack([ideal, np.ones(len(ideal))]) * depth.reshape(-1, 1)
-    seen, valid = rs.project_points(points, camera, motion, "constant-motion")
-    shift = np.where((valid & np.isfinite(depth.ravel()))[:, None], seen - xy, np.nan)
-    shift = shift.reshape(height, width, 2).astype(np.float32)
-    target = xy.reshape(height, width, 2).astype(np.float32)
-    source = target.copy()
-    for _ in range(steps):
-        found = cv2.remap(shift, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderValue=(np.nan, np.nan))
-        source = target - np.nan_to_num(found)
-    found = cv2.remap(shift, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderValue=(np.nan, np.nan))
-    known = (np.abs(source + found - target) < 0.05).all(axis=2)
-    return cv2.remap(pixels, source[..., 0], source[..., 1], cv2.INTER_LANCZOS4), known
 
 
 def fountain(bench: Bench, times: float = 3.0) -> None:

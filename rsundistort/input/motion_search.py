@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,7 @@ class _Trial:
 class _Best:
     """The motion by which most measurements fit, and how many; or the problem with the photo."""
 
-    phi: Array
+    phi: Array = field(default_factory=lambda: np.zeros(3))
     num_fitting: int = 0
     problem: str = ""
 
@@ -147,12 +147,12 @@ def search_motions(
     for start in range(0, len(trials), at_once):
         best: dict[str, _Best] = {}
         some = trials[start : start + at_once]
-        results = workers.map(_try, some, lambda trial, why: _Best(np.zeros(3), problem=f"{trial.name}: {why}"))
+        results = workers.map(_try, some, lambda trial, why: _Best(problem=f"{trial.name}: {why}"))
         with closing(results):
             for done, (trial, found) in enumerate(zip(some, results, strict=True), start + 1):
                 if found.problem:
                     raise FileError(found.problem)
-                if found.num_fitting > best.get(trial.name, _Best(np.zeros(3))).num_fitting:
+                if found.num_fitting > best.get(trial.name, _Best()).num_fitting:
                     best[trial.name] = found
                 log.tell(stage, done, len(trials))
         motions |= {name: each.phi for name, each in best.items() if each.num_fitting >= _LEAST}
@@ -176,12 +176,12 @@ def _try(trial: _Trial) -> _Best:
     try:
         photo = read_photo(trial.source, trial.max_megapixels)
     except FileError as error:
-        return _Best(np.zeros(3), problem=str(error))
+        return _Best(problem=str(error))
     height, width = photo.pixels.shape[:2]
     mask = None if trial.own_mask is None else read_mask(trial.own_mask, width, height)
     reduced = reduce_photo(photo.pixels, mask, trial.megapixels)
     camera = _resized(trial.camera, reduced.gray)
-    best = _Best(np.zeros(3))
+    best = _Best()
     for phi in trial.phi:
         found = _placed_without(phi, reduced.gray, reduced.mask, camera, trial.shown)
         if found is not None and found.num_fitting > best.num_fitting:

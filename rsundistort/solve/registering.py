@@ -147,9 +147,11 @@ class Registrar:
 
     def _with_found_motions(self, result: BundleResult, left_out: set[str]) -> tuple[Registrar, BundleResult, set[str]]:
         matched, find = self.track_source.matched, self.track_source.with_found_motions
+        if find is None:
+            return self, result, left_out
         suspects = self.suspects(result.reconstruction)
         num_right = result.reconstruction.num_images - len(suspects)
-        if find is None or num_right == len(matched.names):
+        if num_right == len(matched.names):
             return self, result, left_out
         scene = self._new_tracks(result.reconstruction)
         scene = scene.take_photos(~np.isin(scene.image_names, suspects))
