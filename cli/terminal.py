@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -246,6 +247,13 @@ class _Bars:
             count = f"{self._count:>8}" if self._count else ""
             say(f"{self._stage:<34} {time.perf_counter() - self._began:8.1f} s{count}")
 
+    def note(self, text: str) -> None:
+        """A line between those of stages."""
+        with self._lock:
+            if self._bar is not None:
+                self._bar.clear()
+            say(text)
+
     def close(self) -> None:
         self._ended.set()
         with self._lock:
@@ -292,10 +300,26 @@ def progress_bars(talk: Talk) -> Iterator[Callable[[str, int, int], None]]:
     shown = sys.stderr.isatty() and not talk.quiet
     lines = shown or (talk.verbose and not talk.quiet)
     bars = _Lines() if talk.progress == "json" else _Bars(shown, lines, talk.verbose)
+    with _noted(bars.note) if lines and isinstance(bars, _Bars) else nullcontext():
+        try:
+            yield bars
+        finally:
+            bars.close()
+
+
+@contextmanager
+def _noted(note: Callable[[str], None]) -> Iterator[None]:
+    """What the package logs is shown."""
+    handler, logger = logging.Handler(), logging.getLogger("rsundistort")
+    handler.emit = lambda record: note(record.getMessage())  # type: ignore[method-assign]
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
     try:
-        yield bars
+        yield
     finally:
-        bars.close()
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:

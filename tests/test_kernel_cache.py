@@ -71,7 +71,8 @@ def small(written, monkeypatch):
             sys.modules.pop(module, None)
         importlib.invalidate_caches()
         _jit._stamp.cache_clear()
-        _jit._tell.cache_clear()
+        for once in (_jit._tell, _jit._tell_of_compiling):
+            once.cache_clear()
         twice = importlib.import_module("small").twice
         assert twice(21) == expected
         return sum(twice.stats.cache_hits.values())
@@ -119,6 +120,12 @@ def test_what_was_cut_short_is_compiled_again(small, written, suffix, length):
     (damaged,) = written[1].rglob(f"small.twice*{suffix}")
     damaged.write_bytes(damaged.read_bytes()[:length])
     assert [small(), small()] == [0, 1]
+
+
+def test_compiling_is_logged_and_reading_is_not(small, caplog):
+    caplog.set_level("INFO", logger="rsundistort")
+    assert [small(), small()] == [0, 1]
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == ["compiling kernels"]
 
 
 def test_without_a_folder_it_is_compiled_in_memory_and_reported_once(small):

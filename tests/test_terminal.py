@@ -19,9 +19,9 @@ from rsundistort_cli.terminal import Talk, progress_bars
 
 from rsundistort import Camera, RowMotion, Solution, SolvedImage
 
-# a program that says what a run says: stages, a warning, an error
+# a program that says what a run says: stages, what the package logs, a warning, an error
 TALKER = """
-import sys, warnings
+import logging, sys, warnings
 from rsundistort_cli.terminal import Talk, errors_for_people, progress_bars
 from rsundistort.errors import InputError, RsUndistortWarning
 with errors_for_people(), progress_bars(Talk(verbose="-v" in sys.argv, quiet="-q" in sys.argv)) as progress:
@@ -29,6 +29,7 @@ with errors_for_people(), progress_bars(Talk(verbose="-v" in sys.argv, quiet="-q
     progress("features", 10, 10)
     progress("model sequence: global", 0, 0)
     progress("model sequence: rotation", 0, 0)
+    logging.getLogger("rsundistort").info("compiling kernels")
     warnings.warn("take another photo", RsUndistortWarning)
     progress("writing", 0, 0)
     raise InputError("no photos; give another folder")
@@ -153,6 +154,7 @@ def test_stages_errors_and_warnings_in_a_terminal():
     for stage in ("features", "model sequence", "writing"):
         assert stage in said
     assert "model sequence: rotation" not in said
+    assert "\ncompiling kernels" in said
     assert "\x1b[33mwarning: take another photo" in said
     assert "\x1b[31merror: no photos; give another folder" in said
 
@@ -168,6 +170,7 @@ def test_verbose_tells_steps_and_quiet_only_what_went_wrong():
     assert "model sequence: rotation" in said
     quiet, _ = in_a_terminal(TALKER, "-q")
     assert "model sequence" not in quiet
+    assert "compiling" not in quiet
     assert "warning: " in quiet
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -72,6 +73,12 @@ def _tell(what: str) -> None:
     )
 
 
+@lru_cache
+def _tell_of_compiling() -> None:
+    """Said once, since a stage may stand still for a minute; commands show it where they show progress."""
+    logging.getLogger("rsundistort").info("compiling kernels: one to two minutes, once per installation")
+
+
 class _SelfContained(JITCodeLibrary):
     """Machine code that runs its own copies of the kernels that it calls.
 
@@ -92,6 +99,7 @@ class _SelfContained(JITCodeLibrary):
 @contextmanager
 def _self_contained() -> Iterator[None]:
     """Kernels that are compiled in this block are self-contained; numba's lock of its compiler is held."""
+    _tell_of_compiling()
     codegen = cpu_target.target_context.codegen()
     before = codegen._library_class
     codegen._library_class = _SelfContained
