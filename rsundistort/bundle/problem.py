@@ -237,7 +237,7 @@ class BundleProblem:
         found = np.hstack([self._start.phi, self._start.velocity])[:, : self._block - 6]
         motion[:, : self._block - 6] = np.where(self._free[:, 6 : self._block], found, 0.0)
         start, means = self._start, self._means_start
-        variation = start.variation if self._options.varying else np.zeros_like(start.variation)
+        variation = start.variation.copy() if self._options.varying else np.zeros_like(start.variation)
         bend = np.where(self._free[:, self.layout.variation : self.layout.size], self.layout.coefficients(start), 0.0)
         cameras = tuple(start.cameras) if self.lens_fields is None else self.lens_fields.started(start.cameras)
         path = self._path_start
