@@ -147,8 +147,8 @@ def _source(solution: Solution) -> Iterator[tuple[str, str]]:
             f"{model['observations']} of {model['points']} in the model",
         )
         frames = {
-            "stored": "the model shows the photos as they are stored",
-            "not looked at": "taken for the stored one",
+            "stored": "not rotated by the EXIF orientation, by the sizes",
+            "not looked at": "taken for that of the files",
         }
         yield "pixel frame", frames.get(model["frame"], model["frame"] + ", and rotated back")
     if video := options.get("video"):

@@ -309,6 +309,9 @@ def test_depths_that_make_no_sense_are_refused():
         distort_points(xy, camera, MOTION, MODEL, depth=[1.0, 2.0])
     with pytest.raises(InputError, match="not positive"):
         undistort_points(xy, camera, MOTION, MODEL, depth=[1.0, 2.0, 0.0])
+    for depth in ("near", [1.0, 2.0], -5.0):  # also where the model needs none
+        with pytest.raises(InputError, match="depth"):
+            undistort_points(xy, camera, MOTION, "rotation", depth=depth)
     with pytest.raises(InputError, match="P is needed"):
         undistort_points(xy, camera, MOTION, MODEL, depth=DepthMap(smooth_depth()))
     with pytest.raises(InputError, match="depth map is one of 20x16 pixels, the rectified photo has 200x160"):

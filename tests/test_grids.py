@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from rsundistort import Camera, Plane, RemapGrid, RowMotion, init_rectify_map, rectify, undistort_points
 from rsundistort.errors import FileError, FormatError, InputError
+from rsundistort.rectify import largest_shift_px
 from rsundistort.rectify.coarse_grid import TOLERANCE_PX, coarse_grid
 from rsundistort.rectify.maps import EDGE_PX, fill_rows, rectified_rays
 
@@ -203,6 +204,17 @@ def test_grid_is_applied_as_rectify_does(rng):
         grid.apply(photo[:300])
     with pytest.raises(InputError, match="interpolation='area'"):
         grid.apply(photo, "area")
+
+
+@pytest.mark.parametrize(
+    ("new", "says"),
+    [(make_camera(LENS), "lens distortion"), (K, "new_camera: expected"), (0, "new_camera: expected")],
+    ids=["lens", "matrix", "zero"],
+)
+def test_a_grid_is_of_a_pinhole_camera(new, says):
+    for use in (RemapGrid.from_camera, partial(rectify, np.zeros((H, W), np.uint8)), largest_shift_px):
+        with pytest.raises(InputError, match=says):
+            use(make_camera(), MOTION, new_camera=new)
 
 
 @pytest.mark.parametrize(

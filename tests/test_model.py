@@ -10,16 +10,21 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     Camera,
+    DepthMap,
     Observations,
+    Plane,
     Reconstruction,
+    RemapGrid,
     RowMotion,
     RsUndistortError,
     Solution,
     SolvedImage,
+    distort_points,
     project_points,
+    undistort_points,
 )
 from rsundistort.errors import InputError
-from rsundistort.model import other_axis
+from rsundistort.model import Bend, other_axis
 from rsundistort.model.projection import clock_of
 
 K = [[500.0, 0, 320], [0, 400, 240], [0, 0, 1]]
@@ -266,6 +271,10 @@ def test_a_motion_in_the_other_frame_is_refused_where_it_matters():
     assert image.motion.frame == "world"
     with pytest.raises(InputError, match=r"is in the world frame, expected the camera frame; call motion.in_camera"):
         project_points(point, camera, image.motion, "constant-motion")
+    for depth in ([5.0], Plane([0, 0, 1], 5.0)):
+        for undistorts in (undistort_points, distort_points):
+            with pytest.raises(InputError, match="expected the camera frame"):
+                undistorts([[300.0, 200.0]], camera, image.motion, "constant-motion", P=camera.K, depth=depth)
     ours = image.motion.in_camera(R_cw)
     unsaid = RowMotion(image.motion.phi, R_cw @ image.motion.velocity)
     for model in ("rotation", "constant-motion"):
@@ -282,3 +291,31 @@ def test_a_motion_in_the_other_frame_is_refused_where_it_matters():
     project_points(point, camera, turning, "constant-motion")
     with pytest.raises(InputError, match="frame='body', expected one of world, camera"):
         RowMotion(frame="body")
+
+
+# ---------------------------------------------------------------- equality
+
+
+@pytest.mark.parametrize(
+    ("make", "other"),
+    [
+        (lambda: RowMotion([0.1, 0, 0], bend=Bend(-1, 1, np.full((4, 3), 0.1))), RowMotion([0.1, 0, 0])),
+        (lambda: Plane([0, 0, 1], 2.0), Plane([0, 0, 1], 3.0)),
+        (lambda: DepthMap([[1.0, np.nan]]), DepthMap([[1.0, 2.0]])),
+        (lambda: Camera(64, 48, [[50, 0, 32], [0, 50, 24], [0, 0, 1]], [0.1, 0, 0, 0]), 3),
+        (lambda: SolvedImage("a.jpg", "1", np.eye(3), np.zeros(3), RowMotion()), SolvedImage("a.jpg", "1")),
+        (lambda: make_solution(images=[SolvedImage("a.jpg", "1")]), make_solution(images=[])),
+        (lambda: RemapGrid(np.ones((2, 2)), np.ones((2, 2)), 4, 4), RemapGrid(np.zeros((2, 2)), np.ones((2, 2)), 4, 4)),
+    ],
+)
+def test_values_that_hold_arrays_are_equal_if_all_of_it_is(make, other):
+    one, same = make(), make()
+    assert one == same
+    assert same in [other, one]
+    assert one != other
+    if not isinstance(one, Solution):  # it holds mappings
+        assert len({one, same, other}) == 2
+
+
+def test_zeros_of_either_sign_are_one_key():
+    assert len({RowMotion([0.0, 0.1, 0]), RowMotion([-0.0, 0.1, 0])}) == 1

@@ -19,6 +19,7 @@ from rsundistort import (
     Solution,
     SolvedImage,
     SolveOptions,
+    ViewOptions,
     evaluate,
     read_solution,
     rectify,
@@ -102,6 +103,7 @@ def test_poses_and_motions_are_near_the_truth(courtyard, solved):
     assert result.phi_mrad_per_frame.mean < 0.25 * still  # the photos do move
 
 
+@pytest.mark.filterwarnings("ignore:skipped")
 def test_references_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_path):
     truth = read_solution(courtyard / "ground_truth.json")
     camera = truth.cameras["1"]
@@ -111,6 +113,12 @@ def test_references_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_pa
     result = evaluate(solved[1], courtyard / "ground_truth.json", twins=tmp_path)
     assert set(result.psnr_db.photos) == set(COURTYARD_NAMES)
     assert result.psnr_db.median > result.psnr_before_db.median + 3
+    # they are brought to the size of others
+    small, options = tmp_path / "small", RectifyOptions(view=ViewOptions(scale=0.5))
+    rectify_folder(courtyard / "photos", solved[1] / "solution.json", small, options)
+    again = evaluate(small, courtyard / "ground_truth.json", twins=tmp_path)
+    assert again.psnr_db.median > result.psnr_db.median - 1
+    assert again.psnr_before_db.median < again.psnr_db.median - 3  # of the whole photos
 
 
 def test_outputs_of_a_run(solved):

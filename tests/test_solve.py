@@ -533,4 +533,6 @@ def test_photos_that_were_rectified_before_are_refused(tmp_path, rng):
     rs.solve(model, tmp_path / "first", OPTIONS, images=photos)
     with pytest.raises(InputError, match=r"all photos were rectified already, by rsundistort .*; give the raw ones"):
         rs.solve(model, tmp_path / "out", OPTIONS, images=tmp_path / "first" / "images")
+    with pytest.raises(InputError, match=r"shows the rectified photos of .*first, not those in .*photos; `rsundistort"):
+        rs.solve(tmp_path / "first" / "sparse", tmp_path / "out", OPTIONS, images=photos)
     assert not (tmp_path / "out").exists()

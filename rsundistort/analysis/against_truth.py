@@ -15,13 +15,16 @@ from ..batch.progress import ProgressCallback, StageLog
 from ..errors import FileError, InputError
 from ..evaluation import motion_errors, pose_errors, psnr
 from ..io import output_name, read_photo, read_solution
-from ..model import RowMotion, Solution, SolvedImage
+from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.array_types import Array
 from ..model.orientation import INVERSE, in_stored_frame, orient_pixels
 from ..rectify import rectify
 from .results import ErrorSummary, Evaluation, PhiErrorSummary, PsnrSummary
 
 __all__ = ["evaluate"]
+
+# Focal lengths that differ by this share are of views that somebody chose, not of what was found of one.
+_OTHER_VIEW = 0.01
 
 
 def _summary(values: Array) -> ErrorSummary:
@@ -56,10 +59,11 @@ def evaluate(
         Solution to take the true poses from, e.g. of the same photos without motion.
     twins : path, optional
         Folder of global-shutter photos of the same names (or JPEG files of the same stems), taken by the same camera: a
-        lens is taken out of them before the comparison. `global` beside the truth file when there is one. Photos
-        without a reference are not compared, if any has one.
+        lens is taken out of them before the comparison, and they are brought to another view or size. `global` beside
+        the truth file when there is one. Photos without a reference are not compared, if any has one.
     raw : path, optional
-        Folder of the photos that were rectified, for the figure before; `photos` beside the truth file.
+        Folder of the photos that were rectified, for the figure before, which leaves out what the rectified photo does
+        not show, if that is of the same size; `photos` beside the truth file.
     progress : callable, optional
         Called as (stage, done, total).
 
@@ -106,17 +110,25 @@ def _reference_path(folder: Path, name: str) -> Path:
     return small if small.is_file() and not path.is_file() else path
 
 
-def _without_lens(
+def _as_rectified(
     reference: NDArray[Any], image: SolvedImage, solution: Solution, truth: Solution
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """A global-shutter photo as the rectified camera would have taken it, and the mask of what it shows."""
+    """A global-shutter photo as the rectified camera would have taken it, and the mask of what it shows.
+
+    One of a pinhole camera stays as it is if it shows the same view: what focal length was found is part of the error.
+    """
     by_name = {each.name: each for each in truth.images}
     taken_by = truth.cameras[by_name[image.name].camera_id] if image.name in by_name else None
     rectified = solution.rectified_cameras[image.camera_id]
     whole = np.full(reference.shape[:2], 255, np.uint8)
-    if taken_by is None or taken_by.is_pinhole:
+    if taken_by is None or (taken_by.is_pinhole and _same_view(taken_by, rectified)):
         return reference, whole
     return rectify(reference, taken_by, RowMotion(), "global", rectified)
+
+
+def _same_view(camera: Camera, other: Camera) -> bool:
+    same_size = (camera.width, camera.height) == (other.width, other.height)
+    return same_size and bool(np.allclose(np.diag(camera.K), np.diag(other.K), rtol=_OTHER_VIEW))
 
 
 def _check_sizes(photo: NDArray[Any], mask: NDArray[Any], shown: NDArray[np.uint8]) -> None:
@@ -151,12 +163,13 @@ def _image_errors(
         files = out / "images" / output_name(image.name, raw_as), out / "masks" / masks[image.name]
         photo, mask = (orient_pixels(read_photo(path).pixels, INVERSE[orientations[image.name]]) for path in files)
         try:
-            reference, shown = _without_lens(taken, image, solution, truth)
+            reference, shown = _as_rectified(taken, image, solution, truth)
             _check_sizes(photo, mask, shown)
             after[image.name] = psnr(photo, reference, np.minimum(mask, shown))
             if (raw / image.name).is_file():
                 # photo and reference have the same lens
-                before[image.name] = psnr(read_photo(raw / image.name).pixels, taken, mask)
+                counts = mask if mask.shape == taken.shape[:2] else None
+                before[image.name] = psnr(read_photo(raw / image.name).pixels, taken, counts)
         except InputError as error:
             raise InputError(f"{image.name}: {error}") from error
         log.tell("comparing", done, len(registered))

@@ -10,6 +10,7 @@ from ..critical import advise_poses, critical_motion
 from ..errors import FileError, InputError
 from ..io import read_colmap_poses, read_solution, read_transforms
 from ..io.places import local_place
+from ..io.record import Record
 from ..model import check_readout
 from ..model.orientation import in_stored_frame
 from .results import PoseAnalysis
@@ -23,7 +24,8 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
     Parameters
     ----------
     path : path
-        `solution.json`, or a folder that holds one (a run's output); a COLMAP model; a `transforms.json`.
+        `solution.json`, or a folder that holds one (a run's output); a COLMAP model; a `transforms.json`. Of those that
+        a run wrote its solution is taken, which says how photos were read.
     readout : str, optional
         Readout direction of all photos; else the solution's, else top-to-bottom.
 
@@ -41,6 +43,8 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
     sentence, advice = None, None
     if path.is_dir() and (path / "solution.json").is_file():
         path = path / "solution.json"
+    elif (path.parent / Record.NAME).is_file() and (path.parent / "solution.json").is_file():
+        path = path.parent / "solution.json"
     if path.is_dir():
         _, names, _, R_cw, center_w, *_ = read_colmap_poses(path, any_lens=True)
         directions = [readout or "top-to-bottom"] * len(names)

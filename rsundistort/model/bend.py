@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from ..errors import InputError
 from .array_types import Array
 from .checks import check_finite, check_whole, frozen
+from .values import ComparedByFields
 
 __all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table", "parts_of", "splines_at"]
 
@@ -124,8 +125,8 @@ def parts_of(clock: Array, readings: Array, sites: int) -> tuple[Array, Array, A
     return values - mean - place[:, None] * slope, mean - rate * (clock[0] + clock[-1]) / 2, rate
 
 
-@dataclass(frozen=True)
-class Bend:
+@dataclass(frozen=True, eq=False)
+class Bend(ComparedByFields):
     """How rotation and position depart from those of a steady motion, while the clock runs over a frame.
 
     Parameters

@@ -13,6 +13,7 @@ from ..errors import InputError
 from .array_types import Array
 from .checks import check_finite, check_numbers, check_one_of, check_whole, frozen
 from .field import folds, spline_coefficients
+from .values import ComparedByFields
 
 __all__ = ["LENSES", "READOUTS", "Camera", "check_readout", "opposite", "other_axis"]
 
@@ -80,8 +81,8 @@ def _fold_radius_squared(lens: str, dist: Array) -> float:
     return min(_first_positive(slope), _first_positive(den))
 
 
-@dataclass(frozen=True)
-class Camera:
+@dataclass(frozen=True, eq=False)
+class Camera(ComparedByFields):
     """A physical camera in one mode.
 
     Parameters
@@ -146,20 +147,6 @@ class Camera:
         if folds(values, self.width, self.height):
             raise InputError(f"field holds values of up to {np.abs(values).max():g} px: it would fold the photo")
         return values
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Camera):
-            return NotImplemented
-        return (
-            (self.width, self.height, self.readout, self.lens) == (other.width, other.height, other.readout, other.lens)
-            and np.array_equal(self.K, other.K)
-            and np.array_equal(self.dist, other.dist)
-            and np.array_equal(self.field, other.field)
-        )
-
-    def __hash__(self) -> int:
-        arrays = (self.K.tobytes(), self.dist.tobytes(), self.field.tobytes())
-        return hash((self.width, self.height, self.readout, self.lens, *arrays))
 
     def varied(self, log_f: float, cx: float, cy: float) -> Camera:
         """The camera with its focal lengths times exp(log_f), its principal point shifted by cx fx and cy fy."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .array_types import Array
 from .checks import check_array, check_finite, check_number, check_numbers, check_size, frozen
+from .values import ComparedByFields
 
 __all__ = ["AtInfinity", "Depth", "DepthMap", "Plane", "check_depth"]
 
@@ -20,8 +21,8 @@ class AtInfinity:
     """Everything is so far away that the translation of the camera moves nothing."""
 
 
-@dataclass(frozen=True)
-class Plane:
+@dataclass(frozen=True, eq=False)
+class Plane(ComparedByFields):
     """Everything lies on a plane, such as the ground below a drone; beyond its horizon things are at infinity.
 
     Parameters
@@ -57,8 +58,8 @@ class Plane:
         return np.maximum(directions @ self.normal / self.distance, 0.0)
 
 
-@dataclass(frozen=True)
-class DepthMap:
+@dataclass(frozen=True, eq=False)
+class DepthMap(ComparedByFields):
     """A depth for each pixel of the rectified photo.
 
     Parameters

@@ -14,6 +14,7 @@ from .array_types import Array
 from .bend import Bend, bend_table, parts_of
 from .camera import check_readout
 from .checks import check_finite, check_kind, check_number, check_numbers, check_one_of, check_rotation, frozen
+from .values import ComparedByFields
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model", "steady_parts"]
 
@@ -71,8 +72,8 @@ def steady_parts(clock: Array, moved: Array, sites: int) -> tuple[Array, Array, 
     return rest.reshape(sites, k, 6).transpose(1, 0, 2), correction, constant[:, 1], rate.reshape(k, 2, 3)
 
 
-@dataclass(frozen=True)
-class RowMotion:
+@dataclass(frozen=True, eq=False)
+class RowMotion(ComparedByFields):
     """Motion during the readout, per unit of the clock r (r is 0 at the principal row).
 
     Parameters

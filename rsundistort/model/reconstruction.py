@@ -15,6 +15,7 @@ from .bend import Bend
 from .camera import Camera
 from .checks import check_fields, check_finite, check_index, check_numbers, check_rotations, frozen
 from .motion import RowMotion, check_shutter_model
+from .values import ComparedByFields
 
 __all__ = ["Observations", "Reconstruction"]
 
@@ -28,8 +29,8 @@ def _or(value: Any, default: Array, name: str) -> Array:
     return array if array.size else default
 
 
-@dataclass(frozen=True)
-class Observations:
+@dataclass(frozen=True, eq=False)
+class Observations(ComparedByFields):
     """Where photos see points: `xy_raw[k]` is point `point_idx[k]` in photo `frame_idx[k]`.
 
     Parameters
@@ -71,8 +72,8 @@ class Observations:
         return Observations(self.frame_idx[keep], self.point_idx[keep], self.xy_raw[keep], self.sigma[keep])
 
 
-@dataclass(frozen=True)
-class Reconstruction:
+@dataclass(frozen=True, eq=False)
+class Reconstruction(ComparedByFields):
     """Cameras, poses, shutter motions and points; all poses at the principal row.
 
     Parameters

@@ -15,13 +15,14 @@ from .camera import Camera
 from .checks import check_array, check_fields, check_finite, check_photo_name, check_rotation, frozen
 from .former_fields import former_fields
 from .motion import RowMotion, check_shutter_model
+from .values import ComparedByFields
 
 __all__ = ["Solution", "SolvedImage"]
 
 
 @former_fields(turned="applied_orientation")
-@dataclass(frozen=True)
-class SolvedImage:
+@dataclass(frozen=True, eq=False)
+class SolvedImage(ComparedByFields):
     """One photo of a solution.
 
     Attributes
@@ -105,8 +106,8 @@ class SolvedImage:
         return self.R_cw is not None and self.center_w is not None
 
 
-@dataclass(frozen=True)
-class Solution:
+@dataclass(frozen=True, eq=False)
+class Solution(ComparedByFields):
     """Poses and motions of a folder of photos; what `solution.json` holds.
 
     Attributes

@@ -15,8 +15,9 @@ from .._kernels import maps as kernels
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Depth, RowMotion
 from ..model.arrays import read_arrays
-from ..model.checks import check_array, check_size, check_whole, frozen
-from .maps import init_rectify_map, seen_by
+from ..model.checks import check_array, check_kind, check_size, check_whole, frozen
+from ..model.values import ComparedByFields
+from .maps import check_rectified, init_rectify_map, seen_by
 from .photo import check_interpolation, check_photo, remap_strips
 
 __all__ = ["MAP_KINDS", "RemapGrid"]
@@ -32,8 +33,8 @@ _MOST_PIXELS_A_BYTE, _LEAST_LIMIT = 4, 1 << 24
 _ATTRIBUTE = "rsundistort"
 
 
-@dataclass(frozen=True)
-class RemapGrid:
+@dataclass(frozen=True, eq=False)
+class RemapGrid(ComparedByFields):
     """For each pixel of an image, which pixel of its source it shows: (x, y), integer centres.
 
     Parameters
@@ -85,7 +86,8 @@ class RemapGrid:
         camera, motion, shutter_model, new_camera, depth
             As in `rectify`.
         """
-        target = new_camera or camera.pinhole()
+        check_kind(camera, Camera, "camera")
+        target = camera.pinhole() if new_camera is None else check_rectified(new_camera)
         size = (target.width, target.height)
         map_x, map_y = init_rectify_map(camera, motion, shutter_model, new_K=target.K, size=size, depth=depth)
         assert map_y is not None

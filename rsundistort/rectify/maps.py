@@ -10,13 +10,13 @@ from .._kernels import maps as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
 from ..model.array_types import Array
-from ..model.checks import check_finite, check_rotation, check_size
+from ..model.checks import check_finite, check_kind, check_rotation, check_size
 from ..model.depth import check_depth
 from ..model.field import add_field
 from ..model.projection import motion_of
 from .pixel_depths import DepthRows
 
-__all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
+__all__ = ["check_rectified", "fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
 
 #: A raw position this far (pixels) beyond the outermost pixel centre still counts as seen: rounding of float32 maps.
 EDGE_PX = 1e-3
@@ -30,6 +30,14 @@ def rectified_rays(new_K: ArrayLike | None, R: ArrayLike | None, camera: Camera,
     if abs(np.linalg.det(scaled)) < 1e-18:
         raise InputError(f"{name} is singular")
     return rotation.T @ np.linalg.inv(K)
+
+
+def check_rectified(new_camera: Camera) -> Camera:
+    """The camera of a rectified photo; refused if it is none, or has a lens."""
+    check_kind(new_camera, Camera, "new_camera")
+    if not new_camera.is_pinhole:
+        raise InputError("new_camera has lens distortion; a rectified photo has none")
+    return new_camera
 
 
 def fill_rows(

@@ -20,7 +20,7 @@ from ..model.checks import check_kind, check_one_of, check_whole
 from ..model.depth import check_depth
 from ..model.projection import motion_of
 from .coarse_grid import coarse_grid
-from .maps import fill_rows, rectified_rays, seen_by
+from .maps import check_rectified, fill_rows, rectified_rays, seen_by
 from .pixel_depths import DepthRows
 
 __all__ = ["INTERPOLATIONS", "MAX_SIDE", "rectify"]
@@ -112,12 +112,9 @@ def rectify(
     check_shutter_model(shutter_model)
     jobs = check_whole(jobs, "jobs", 1)
     flag = check_interpolation(interpolation)
-    target = camera.pinhole() if new_camera is None else new_camera
-    check_kind(target, Camera, "new_camera")
+    target = camera.pinhole() if new_camera is None else check_rectified(new_camera)
     if max(target.width, target.height) > MAX_SIDE:
         raise InputError(f"new_camera has {target.width}x{target.height} pixels, OpenCV fills sides up to {MAX_SIDE}")
-    if not target.is_pinhole:
-        raise InputError("new_camera has lens distortion; a rectified photo has none")
     rays = rectified_rays(target.K, None, camera)
     size = (target.width, target.height)
 

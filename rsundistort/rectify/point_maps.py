@@ -13,10 +13,10 @@ from .._kernels.depth import EDGE
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
 from ..model.array_types import Array
-from ..model.checks import check_array, check_finite, check_kind, check_numbers
+from ..model.checks import check_array, check_finite, check_numbers
 from ..model.depth import check_depth
 from ..model.projection import clock_of, motion_of, project_points, unproject_points
-from .maps import rectified_rays
+from .maps import check_rectified, rectified_rays
 from .pixel_depths import inverse_depth_at
 
 __all__ = ["bend_px", "distort_points", "largest_shift_px", "undistort_points"]
@@ -32,14 +32,9 @@ def _homogeneous(xy: Array) -> Array:
     return np.column_stack([xy, np.ones(len(xy))])
 
 
-def _inverse_depths(depth: Depth | ArrayLike, xy: Array, rays: Array) -> Array:
+def _inverse_depths(depth: Depth | Array, xy: Array, rays: Array) -> Array:
     """(n,) inverse depths of rectified pixels (n, 2)."""
-    if isinstance(depth, AtInfinity | Plane | DepthMap):
-        return inverse_depth_at(depth, xy, rays)
-    given = check_array(depth, (len(xy),), "depth")
-    if not (given > 0).all():
-        raise InputError("depth holds a number that is not positive; inf is far")
-    return np.asarray(1.0 / given)
+    return 1.0 / depth if isinstance(depth, np.ndarray) else inverse_depth_at(depth, xy, rays)
 
 
 def _checked(
@@ -49,21 +44,27 @@ def _checked(
     R: ArrayLike | None,
     P: ArrayLike | None,
     depth: Depth | ArrayLike | None,
-) -> tuple[Array, tuple[int, ...], RowMotion, Array, Depth | ArrayLike]:
+) -> tuple[Array, tuple[int, ...], RowMotion, Array, Depth | Array]:
     """Arguments of both directions: points (n, 2), their shape, the motion, rays of `rectified_rays`, and the depth."""
     xy = check_numbers(points, "points")
     if xy.ndim not in (2, 3) or xy.shape[-1] != 2 or (xy.ndim == 3 and 1 not in xy.shape[:2]):
         raise InputError(f"points.shape={xy.shape}, expected (N, 2), (N, 1, 2) or (1, N, 2)")
-    depth = AtInfinity() if depth is None else depth
+    flat = xy.reshape(-1, 2)
+    if depth is None:
+        depth = AtInfinity()
+    elif not isinstance(depth, AtInfinity | Plane | DepthMap):
+        depth = check_array(depth, (len(flat),), "depth")
+        if not (depth > 0).all():
+            raise InputError("depth holds a number that is not positive; inf is far")
     if isinstance(depth, DepthMap) and P is None:
         raise InputError("a depth map has the pixels of the rectified photo: P is needed")
     K = np.eye(3) if P is None else check_finite(P, (3, None), "P")
     rays = rectified_rays(K[:, :3] if K.shape[1] == 4 else K, R, camera, "P")
-    return xy.reshape(-1, 2), xy.shape, motion_of(camera, motion), rays, depth
+    return flat, xy.shape, motion_of(camera, motion), rays, depth
 
 
 def _rectified(
-    xy: Array, camera: Camera, motion: RowMotion, shutter_model: str, rays: Array, depth: Depth | ArrayLike
+    xy: Array, camera: Camera, motion: RowMotion, shutter_model: str, rays: Array, depth: Depth | Array
 ) -> Array:
     """Rectified pixels (n, 2) of raw pixels; rays (3, 3) as of `rectified_rays`."""
     ideal, _ = unproject_points(xy, camera, motion, shutter_model)
@@ -75,7 +76,7 @@ def _rectified(
         return xy_rect
     # Where the camera had got to when it read the row, in homogeneous pixels; what the raw pixel shows lies on the line
     # from there, which starts at infinity where the rotation alone takes the pixel.
-    moved = np.linalg.solve(rays, motion.at(clock_of(camera, xy))[1].T).T
+    moved = np.linalg.solve(rays, motion.as_in("camera").at(clock_of(camera, xy))[1].T).T
 
     def on_line(inverse: Array) -> Array:
         w = inverse[:, None]
@@ -205,7 +206,7 @@ def largest_shift_px(
     """
     motion = motion_of(camera, motion)
     if new_camera is not None:
-        check_kind(new_camera, Camera, "new_camera")
+        check_rectified(new_camera)
     check_depth(depth)
     if depth is None or isinstance(depth, AtInfinity) or shutter_model != "constant-motion":
         u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
@@ -243,7 +244,7 @@ def bend_px(camera: Camera, motion: RowMotion, depth: float = np.inf) -> float:
     points = _homogeneous(ideal)[valid]
     model = "constant-motion" if np.isfinite(depth) else "rotation"
     if np.isfinite(depth):
-        points = depth * points + motion.at(clock_of(camera, raw[valid]))[1] - way
+        points = depth * points + motion.as_in("camera").at(clock_of(camera, raw[valid]))[1] - way
     # the camera of the bent motion is the world here
     near = replace(near, frame="world").in_camera(rotation)
     moved, seen = project_points(points @ rotation.T, camera, near, model)
@@ -267,7 +268,7 @@ def translation_shift_px(camera: Camera, motion: RowMotion, depth: Depth, new_ca
 
 def _rectified_grid(camera: Camera, new_camera: Camera | None) -> tuple[Array, Array]:
     """Pixels (n, 2) over a rectified photo, its border among them, and its K."""
-    new = new_camera or camera.pinhole()
+    new = camera.pinhole() if new_camera is None else check_rectified(new_camera)
     u, v = np.meshgrid(np.linspace(0, new.width - 1, 97), np.linspace(0, new.height - 1, 65))
     return np.column_stack([u.ravel(), v.ravel()]), new.K
 

@@ -230,7 +230,7 @@ def _outputs_of(job: _Job, log: StageLog, before: RunFolder) -> Outputs:
     with work_folder() as work:
         log.begin("model")
         given, track_source, kept = _given(job, work, log)
-        photos = {} if folder is None else _look_at(folder, given.reconstruction, job.rectify.again)
+        photos = {} if folder is None else _look_at(folder, job.model, given.reconstruction, job.rectify.again)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
             given = replace(given, unregistered=_others_in(folder, given, job.rectify.raw_as))
@@ -288,7 +288,9 @@ def _solve_in_memory(
     return colmap_model(rec, cameras, names, rgb.values, ids), replace(solution, stages=tuple(log.stages))
 
 
-def _look_at(folder: Path, rec: Reconstruction, again: bool) -> dict[str, tuple[tuple[int, int] | None, ExifFacts]]:
+def _look_at(
+    folder: Path, model: Path, rec: Reconstruction, again: bool
+) -> dict[str, tuple[tuple[int, int] | None, ExifFacts]]:
     """Size and EXIF facts of each photo of a model."""
     missing = [name for name in rec.image_names if not (folder / name).is_file()]
     if missing:
@@ -300,6 +302,12 @@ def _look_at(folder: Path, rec: Reconstruction, again: bool) -> dict[str, tuple[
     by = [facts.rectified_by for _, facts in found.values()]
     if by and all(by) and not again:
         raise InputError(f"{folder}: all photos were rectified already, by rsundistort {by[0]}; give the raw ones")
+    ours = model.parent
+    if not all(by) and (ours / Record.NAME).is_file() and (ours / "solution.json").is_file():
+        raise InputError(
+            f"{model} shows the rectified photos of {ours}, not those in {folder}; `rsundistort rectify {folder} "
+            f"--solution {ours / 'solution.json'} -o OUT` rectifies these with the motions that were found"
+        )
     return found
 
 
