@@ -274,7 +274,7 @@ class Bench:
                 apart[photo] = float(np.linalg.norm(phi - phi_of[photo]) * tracks.camera(f).frame_span)
                 others = motion_search.tried_motions(tracks.camera(f))[1:]
                 true = [phi_of[photo][None], *(each[:0] for each in others)]
-                with mock.patch.object(motion_search, "tried_motions", lambda _, true=true: true):
+                with mock.patch.object(motion_search, "tried_motions", lambda *_, true=true: true):
                     hidden += [] if find() else [photo]
         off = np.array([each for each in apart.values() if np.isfinite(each)])
         lost = sorted(photo for photo, each in apart.items() if not np.isfinite(each))

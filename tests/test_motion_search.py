@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,6 +20,8 @@ from rsundistort.input.load import load_photos
 from rsundistort.input.motion_search import search_motions, tried_motions
 from rsundistort.sfm import MatchedPhotos
 from rsundistort.sfm.descriptor_matches import DescriptorIndex, match_descriptors
+from rsundistort.solve import track_sources
+from rsundistort.solve.track_sources import TrackSources
 from rsundistort.synthetic import warp_photo
 
 SHIFT_PX, F_PX = 40, 800.0
@@ -45,6 +49,15 @@ def test_rows_are_stretched_and_sheared(readout):
         np.testing.assert_allclose(np.diff(mine), 0.5 * np.exp(each / 2), rtol=0.02)
         assert 0.5 < mine.max() < 1.001
     assert (np.abs(stretch - 1.0) + np.abs(shear) < 2e-3).sum() == 1
+
+
+def test_likely_motions_are_tried():
+    for fastest, expected in ((0.0, 1), (0.2, 1), (0.3, 7), (10.0, 72)):
+        tried = np.concatenate(tried_motions(PINHOLE, fastest))
+        assert len(tried) == expected
+        assert not tried.any(1).all()  # none is among them
+        # half of a step may be missing: of the stretch by 1.65 from 1.28 on
+        assert np.linalg.norm(tried, axis=1).max() < fastest + 0.4
 
 
 @pytest.fixture
@@ -82,7 +95,7 @@ def test_a_motion_is_found_by_what_a_photo_shows_without_it(plane):
 def few_trials(monkeypatch):
     """Only what leads to the motion is tried."""
     tried = [np.zeros((0, 3)), np.zeros((0, 3)), PHI[None] + 0.05, *[np.zeros((0, 3))] * 3]
-    monkeypatch.setattr(motion_search, "tried_motions", lambda _: tried)
+    monkeypatch.setattr(motion_search, "tried_motions", lambda *_: tried)
 
 
 @pytest.mark.usefixtures("few_trials")
@@ -90,6 +103,32 @@ def test_the_number_of_threads_changes_nothing(plane):
     one, two = (search_motions(*plane, 1.0, Workers(jobs), StageLog(None)) for jobs in (1, 2))
     np.testing.assert_array_equal(one["2.png"], two["2.png"])
     np.testing.assert_allclose(one["2.png"], PHI, atol=0.02)
+
+
+def test_nothing_is_searched_where_no_likely_motion_hides_a_photo(plane):
+    said = []
+    search = partial(search_motions, *plane, 1.0, Workers(1), StageLog(lambda *each: said.append(each)))
+    span = PINHOLE.frame_span
+    assert search(phi_sigma=0.05 * span) == search(passed_over=["2.png"]) == {}
+    assert not said
+    np.testing.assert_allclose(search(phi_sigma=0.3 * span)["2.png"], PHI, atol=0.02)
+
+
+def test_a_search_in_vain_is_not_repeated_in_no_larger_a_scene(plane, monkeypatch):
+    photos, matched, scene = plane
+
+    def search(*_, phi_sigma, passed_over):
+        assert phi_sigma == 0.1
+        searched.append(set(photos.names).difference(known.image_names, passed_over))
+        return {}
+
+    searched = []
+    monkeypatch.setattr(track_sources, "search_motions", search)
+    other = SimpleNamespace(megapixels=1.0, workers=Workers(1))
+    sources = TrackSources(photos, None, 0, StageLog(None), "all", None, None, other)
+    for known in (scene.take_photos(np.arange(2) < 1), scene.take_photos(np.arange(2) < 1), scene):
+        assert sources._with_found_motions(matched, known, 0.1) is None
+    assert searched == [{"1.png", "2.png"}, set(), {"2.png"}]
 
 
 def test_photos_of_a_fisheye_are_passed_over(plane):

@@ -434,8 +434,8 @@ def test_a_photo_whose_motion_is_found_is_registered(scene, matched):
     """One that matches nothing as it was taken, but everything without the motion that a search found."""
     asked = []
 
-    def find(before, known):
-        asked.append((before, known.image_names))
+    def find(before, known, phi_sigma):
+        asked.append((before, known.image_names, phi_sigma))
         return TrackSource(matched, rough_phi={"5.jpg": scene.phi[5] + 0.05})
 
     pycolmap, nothing = quiet_pycolmap(), matched.database.with_name("nothing.db")
@@ -448,7 +448,7 @@ def test_a_photo_whose_motion_is_found_is_registered(scene, matched):
     registrar = Registrar(source, BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(scene.take_photos(np.arange(6) < 5), "rotation", rough_options(BundleOptions()))
     best, found, left_out = registrar.without_motions(start, set())
-    assert asked == [(source.matched, tuple(NAMES[:5]))]
+    assert asked == [(source.matched, tuple(NAMES[:5]), start.phi_rms)]
     assert found.reconstruction.image_names == tuple(NAMES)
     assert apart_deg(found.reconstruction, scene).max() < 0.1
     assert best.track_source.matched is matched

@@ -6,7 +6,7 @@ photos taken from other sides (Morel and Yu, ASIFT, SIAM J. Imaging Sciences 200
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +32,8 @@ __all__ = ["search_motions", "tried_motions"]
 # Steps of the logarithm of a stretch along the readout, and of a shear, of what is seen: half of a step costs a photo
 # of dslr less than half of its matches. Rows never run on backwards, nor much faster than twice as fast.
 _STEP, _STRETCHES, _LARGEST_SHEAR = 0.5, np.exp(0.5 * np.arange(-4, 2)), 1.0
+# Motions of so many prior standard deviations, of those found, are taken into account.
+_LIKELY = 4.0
 # Size of what features are detected in, of so many at most.
 _MEGAPIXELS, _MAX_FEATURES = 0.3, 8192
 # Registered photos that are asked, those next to a photo in the order of names.
@@ -82,8 +84,10 @@ class _Best:
     problem: str = ""
 
 
-def tried_motions(camera: Camera) -> list[Array]:
+def tried_motions(camera: Camera, fastest: float = np.inf) -> list[Array]:
     """Rotations phi, radians per unit of the clock, that stretch and shear what a camera reads: (k, 3) by stretch.
+
+    Those that stand for none of up to `fastest`, half of a step away at most, are left out.
 
     A point x at the clock r appears at x - r phi x e_z without rotation, so that phi across the readout stretches along
     it, and phi along the readout shears. A rotation about the optical axis does both in opposite ways on both sides of
@@ -97,7 +101,9 @@ def tried_motions(camera: Camera) -> list[Array]:
         shear = step * np.arange(-int(_LARGEST_SHEAR / step), int(_LARGEST_SHEAR / step) + 1)
         phi = np.zeros((len(shear), 3))
         phi[:, across], phi[:, along] = sign * (stretch - 1.0), shear
-        tried.append(phi)
+        nearest = min(1.0, stretch * np.exp(0.5 * _STEP)) if stretch < 1.0 else max(1.0, stretch * np.exp(-0.5 * _STEP))
+        slowest = np.hypot(nearest - 1.0, np.maximum(np.abs(shear) - 0.5 * step, 0.0))
+        tried.append(phi[slowest <= fastest])
     return tried
 
 
@@ -108,10 +114,14 @@ def search_motions(
     megapixels: float,
     workers: Workers,
     log: StageLog,
+    *,
+    phi_sigma: float = np.inf,
+    passed_over: Collection[str] = (),
 ) -> dict[str, Array]:
     """Rough rotations phi (3,) of photos that a scene lacks, of those that show points of it without their rotation.
 
-    Many photos that are lacking may show another scene: if of some none is found, the search ends.
+    Many photos that are lacking may show another scene: if of some none is found, the search ends. Where no rotation
+    that is likely would hide what a photo shows, there is nothing to search.
 
     Parameters
     ----------
@@ -121,10 +131,15 @@ def search_motions(
         Poses, motions, points; its measurements are keypoints of `matched`.
     megapixels : float
         Largest size of photos in which features are detected.
+    phi_sigma : float
+        Prior standard deviation of each component, radians per frame.
+    passed_over : collection of str
+        Photos that are not searched.
     """
+    hiding = [_hiding(camera, phi_sigma) for camera in scene.cameras]
     asked = [
         k for k, name in enumerate(photos.names)
-        if name not in scene.image_names and scene.cameras[matched.camera_idx[k]].lens != "fisheye"
+        if name not in scene.image_names and name not in passed_over and hiding[matched.camera_idx[k]]
     ]  # fmt: skip
     if not asked:
         return {}
@@ -137,7 +152,7 @@ def search_motions(
         where = photos.folder / name, photos.mask_of.get(name), photos.max_megapixels
         trials += [
             _Trial(name, *where, min(_MEGAPIXELS / stretch, megapixels), camera, phi, of_photo)
-            for stretch, phi in zip(_STRETCHES, tried_motions(camera), strict=True)
+            for stretch, phi in zip(_STRETCHES, hiding[matched.camera_idx[k]], strict=True)
         ]
     if not workers.scheduler:
         sizes = (reading_bytes(each.camera.width, each.camera.height, each.megapixels) for each in trials)
@@ -160,6 +175,14 @@ def search_motions(
             break
     log.end(stage, photos=len(asked), found=sorted(motions))
     return motions
+
+
+def _hiding(camera: Camera, phi_sigma: float) -> list[Array]:
+    """Likely motions that are tried on photos of a camera; none if these are no others than a photo without motion."""
+    if camera.lens == "fisheye":
+        return []
+    tried = tried_motions(camera, _LIKELY * phi_sigma / camera.frame_span)
+    return tried if any(phi.any() for phi in tried) else []
 
 
 def _shown_by_photos(matched: MatchedPhotos, scene: Reconstruction) -> dict[int, tuple[DescriptorIndex, Index]]:

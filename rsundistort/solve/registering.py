@@ -155,7 +155,7 @@ class Registrar:
             return self, result, left_out
         scene = self._new_tracks(result.reconstruction)
         scene = scene.take_photos(~np.isin(scene.image_names, suspects))
-        source = find(matched, scene) if scene.num_images >= LEAST_PHOTOS else None
+        source = find(matched, scene, result.phi_rms) if scene.num_images >= LEAST_PHOTOS else None
         if source is None:
             return self, result, left_out
         best, found, found_left_out = self.with_features(source, result, left_out)

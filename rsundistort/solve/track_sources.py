@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -43,6 +43,8 @@ class TrackSources:
     workers: Workers | None
     other: OtherFeatures | None
     always_affine: bool = False
+    # photos of which a search found no motion, and in how large a scene
+    _unfound: dict[str, int] = field(init=False, default_factory=dict)
 
     def mapped(self) -> tuple[Reconstruction, TrackSource]:
         """A mapping of the photos as they were taken, and the source of its tracks."""
@@ -62,10 +64,15 @@ class TrackSources:
         """Features of the photos of a reconstruction without the motions that it found."""
         return self._without(before, rec, dict(zip(rec.image_names, rec.phi, strict=True)), {})
 
-    def _with_found_motions(self, before: MatchedPhotos, scene: Reconstruction) -> TrackSource | None:
+    def _with_found_motions(self, before: MatchedPhotos, scene: Reconstruction, phi_sigma: float) -> TrackSource | None:
         """Features of photos that a scene lacks without motions that a search finds; None if it finds none."""
         assert self.other is not None
-        phi = search_motions(self.photos, before, scene, self.other.megapixels, self.other.workers, self.log)
+        size = scene.num_images
+        phi = search_motions(
+            self.photos, before, scene, self.other.megapixels, self.other.workers, self.log, phi_sigma=phi_sigma,
+            passed_over=[name for name, largest in self._unfound.items() if size <= largest],
+        )  # fmt: skip
+        self._unfound.update(dict.fromkeys({*self.photos.names}.difference(scene.image_names, phi), size))
         return self._without(before, scene, phi, phi) if phi else None
 
     def _without(

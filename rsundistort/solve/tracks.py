@@ -83,7 +83,7 @@ class TrackSource:
     mapped_here: bool = False
     of_affine: Callable[[bool], tuple[Reconstruction, TrackSource]] | None = None
     without_motions: Callable[[Reconstruction], TrackSource] | None = None
-    with_found_motions: Callable[[MatchedPhotos, Reconstruction], TrackSource | None] | None = None
+    with_found_motions: Callable[[MatchedPhotos, Reconstruction, float], TrackSource | None] | None = None
     rough_phi: Mapping[str, Array] = field(default_factory=dict)
     always_affine: bool = False
 
