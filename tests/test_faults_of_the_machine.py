@@ -243,6 +243,8 @@ def test_a_full_folder_of_temporary_files_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with pytest.raises(FileError, match="database or disk is full; set TMPDIR"), work_folder():
         raise RuntimeError("[database_sqlite.cc:1201] SQLite error: database or disk is full")
+    with pytest.raises(RuntimeError, match="constraint failed"), work_folder():  # not the disk's fault, but ours
+        raise RuntimeError("[database_sqlite.cc:1201] SQLite error: constraint failed")
 
 
 @POSIX

@@ -10,7 +10,7 @@ from rsundistort import Camera, RowMotion, project_points
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.sfm import Features, match_photos, matching, read_num_verified
 from rsundistort.sfm.features import features_of_both
-from rsundistort.sfm.matching import LOOSE_PX, verify_loosely
+from rsundistort.sfm.matching import LOOSE_PX, match_more, verify_loosely
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
 RIGHT, WRONG = 400, 100
@@ -111,3 +111,18 @@ def test_descriptors_of_one_kind_are_compared(rng, tmp_path):
     with quiet_pycolmap().Database.open(matched.database) as db:
         found = {*map(tuple, np.asarray(db.read_matches(1, 2)).tolist())}
     assert found == {(k, k) for k in range(40)}
+
+
+def test_pairs_without_matches_are_not_matched_again(rng, tmp_path):
+    descriptors = sift_like(rng.uniform(0, 90, (400, 128)))
+    features = [
+        Features(rng.uniform([0, 0], [1200, 900], (200, 2)), np.ones(200), descriptors[first : first + 200])
+        for first in (0, 0, 200)
+    ]
+    names, idx = ["a.jpg", "b.jpg", "c.jpg"], np.zeros(3, int)
+    matched = match_photos(tmp_path / "a.db", names, features, [CAMERA], idx, pairs=np.array([[0, 1], [2, 1]]))
+    match_more(matched)
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        assert [len(db.read_matches(*ids)) for ids in ((1, 2), (2, 3), (1, 3))] == [200, 0, 0]
+        assert db.exists_matches(1, 3)
+    match_more(matched)

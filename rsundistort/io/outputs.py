@@ -36,6 +36,9 @@ CANNOT_WRITE = (
     errno.ENOTDIR, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ELOOP,
 )  # fmt: skip
 
+# What SQLite says of these: anything else is our fault.
+_DISK = "disk", "unable to open", "readonly", "read-only"
+
 # Hidden names in OUT that are no outputs: scratch folders, with machine and process, the lock, what a run keeps, and
 # the record.
 _HIDDEN = ".rsundistort-"
@@ -116,9 +119,9 @@ def work_folder() -> Iterator[Path]:
         try:
             yield Path(work)
         except RuntimeError as error:  # pycolmap's
-            if "SQLite error" not in str(error):
-                raise
             said = str(error).partition("SQLite error: ")[2]
+            if not any(words in said for words in _DISK):
+                raise
             raise FileError(f"{here} cannot be written: {said}{mend}") from error
 
 

@@ -83,9 +83,11 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
     The photos are those of `match_photos`, and get the matches; `within_px` and `pairs` are as there.
     """
     close = close_px(matched.features)
-    before = _matched_pairs(matched)
     asked = combinations(range(len(matched.names)), 2) if pairs is None else np.sort(pairs, axis=1).tolist()
-    new = sorted({(first, second) for first, second in asked} - before)
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        # pycolmap lists no pairs that were found to have none
+        each = sorted({(first, second) for first, second in asked})
+        new = [(first, second) for first, second in each if not db.exists_matches(first + 1, second + 1)]
     kinds = [0] if all(each.kind is None for each in matched.features) else [0, 1]
     matchers = [_matcher_of(matched, kind) for kind in kinds]
     with quiet_pycolmap().Database.open(matched.database) as db:
@@ -156,6 +158,6 @@ def _listed(matched: MatchedPhotos, pairs: Index) -> Path:
 
 
 def _matched_pairs(matched: MatchedPhotos) -> set[Pair]:
-    """Pairs that have matches, or were found to have none."""
+    """Pairs that have matches."""
     with quiet_pycolmap().Database.open(matched.database) as db:
         return set(photo_pairs(db.read_all_matches()[0]))

@@ -213,7 +213,7 @@ class Registrar:
             if not scene.num_images:  # as a second mapping may leave them: there is nothing to register photos with
                 self.log.end(stage, added=(), moved=(), dropped=())
                 break
-            if self._confirms(scene, strong) and not strong:
+            if self._confirms(scene, strong, lost.names) and not strong:
                 # a lens that moves contradicts as a wrong place does
                 result, scene = before, self._new_tracks(before.reconstruction)
                 if all_placed:
@@ -291,14 +291,17 @@ class Registrar:
             self._confirmed.update(confirmed)
         return best, best_left_out
 
-    def _confirms(self, scene: Reconstruction, strong: bool) -> bool:
-        """Whether suspects, registered again by the points of the others alone, come back to where they are."""
+    def _confirms(self, scene: Reconstruction, strong: bool, lost: Collection[str]) -> bool:
+        """Whether suspects, registered again by the points of the others alone, come back to where they are.
+
+        Those that lost their places before were registered in this way, and would come back wherever they are.
+        """
         suspects = self._suspects(scene)
         if not suspects.any() or (~suspects).sum() < LEAST_PHOTOS:
             return False
         rest = scene.take_photos(~suspects)
         found = register_photos(self.track_source.matched, self._num_verified, rest, strong=strong)
-        names = [scene.image_names[i] for i in np.flatnonzero(suspects).tolist()]
+        names = [scene.image_names[i] for i in np.flatnonzero(suspects).tolist() if scene.image_names[i] not in lost]
         again = [name for name in found.added if name in names]
         confirmed = bool(again) and agree(scene, found.reconstruction) and same_places(scene, found.reconstruction)
         if confirmed:
