@@ -292,6 +292,14 @@ def test_what_a_rejected_mapping_confirms_says_nothing_of_the_solution(scene, ma
     assert registrar.suspects(start.reconstruction) == ["4.jpg", "5.jpg"]
 
 
+@pytest.mark.parametrize("lost", [set(), {"5.jpg"}])
+def test_a_place_is_confirmed_unless_the_photo_lost_it_before(scene, matched, monkeypatch, lost):
+    monkeypatch.setattr(registering, "contradicting_photos", lambda *_, **__: np.arange(6) == 5)
+    registrar = Registrar(TrackSource(matched), BundleOptions(), StageLog(None))
+    assert registrar._confirms(scene, True, lost) == (not lost)
+    assert registrar._confirmed == {"5.jpg"} - lost
+
+
 def test_a_side_is_carried_along_by_a_photo_that_was_placed_again(scene):
     former, placed = with_a_side_turned(scene, 3, scale=1.7), scene.take_photos(np.arange(6) <= 3)
     found = carried_along(placed, former, NAMES[3:])
