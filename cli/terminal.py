@@ -307,11 +307,21 @@ def progress_bars(talk: Talk) -> Iterator[Callable[[str, int, int], None]]:
             bars.close()
 
 
+class _Notes(logging.Handler):
+    """Gives what is logged to a function."""
+
+    def __init__(self, note: Callable[[str], None]) -> None:
+        super().__init__()
+        self._note = note
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._note(record.getMessage())
+
+
 @contextmanager
 def _noted(note: Callable[[str], None]) -> Iterator[None]:
     """What the package logs is shown."""
-    handler, logger = logging.Handler(), logging.getLogger("rsundistort")
-    handler.emit = lambda record: note(record.getMessage())  # type: ignore[method-assign]
+    handler, logger = _Notes(note), logging.getLogger("rsundistort")
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

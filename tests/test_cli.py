@@ -156,6 +156,16 @@ def test_analyze_a_solution_and_transforms(invoke, tmp_path):
     found = json.loads(invoke("analyze", "transforms.json", "--json").stdout)
     np.testing.assert_allclose(found["singular_values"], as_json["singular_values"], atol=1e-9)
     # read by columns, the same cameras are distinguished
+    # of a run it is the solution that says how photos were read; of other files beside it nothing is taken from there
+    (tmp_path / ".rsundistort-written").write_text("")
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames[:3]}))
+    (tmp_path / "my-transforms.json").write_text(json.dumps({"frames": frames[:3]}))
+    beside, own = (
+        json.loads(invoke("analyze", name, "--json").stdout) for name in ("transforms.json", "my-transforms.json")
+    )
+    assert (beside["photos"], own["photos"]) == (len(frames), 3)
+    (tmp_path / ".rsundistort-written").unlink()
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     columns = json.loads(invoke("analyze", "transforms.json", "--readout", "left-to-right", "--json").stdout)
     assert columns["critical"] is False
     assert columns["advice"] == []

@@ -126,9 +126,11 @@ def test_a_search_in_vain_is_not_repeated_in_no_larger_a_scene(plane, monkeypatc
     monkeypatch.setattr(track_sources, "search_motions", search)
     other = SimpleNamespace(megapixels=1.0, workers=Workers(1))
     sources = TrackSources(photos, None, 0, StageLog(None), "all", None, None, other)
-    for known in (scene.take_photos(np.arange(2) < 1), scene.take_photos(np.arange(2) < 1), scene):
+    alone = scene.take_photos(np.arange(2) < 1)
+    for known in (alone, alone, scene, alone):
         assert sources._with_found_motions(matched, known, 0.1) is None
-    assert searched == [{"1.png", "2.png"}, set(), {"2.png"}]
+    assert searched == [{"1.png", "2.png"}, set(), {"2.png"}, set()]
+    assert sources._unfound == {"1.png": 1, "2.png": 2}
 
 
 def test_photos_of_a_fisheye_are_passed_over(plane):

@@ -17,6 +17,9 @@ from .results import PoseAnalysis
 
 __all__ = ["analyze"]
 
+# Poses that a run writes beside its solution.
+_OF_RUN = "sparse", "transforms.json"
+
 
 def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
     """Whether poses let the shutter be distinguished from the shape of the scene.
@@ -43,7 +46,7 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
     sentence, advice = None, None
     if path.is_dir() and (path / "solution.json").is_file():
         path = path / "solution.json"
-    elif (path.parent / Record.NAME).is_file() and (path.parent / "solution.json").is_file():
+    elif path.name in _OF_RUN and (path.parent / Record.NAME).is_file() and (path.parent / "solution.json").is_file():
         path = path.parent / "solution.json"
     if path.is_dir():
         _, names, _, R_cw, center_w, *_ = read_colmap_poses(path, any_lens=True)

@@ -17,11 +17,15 @@ class ComparedByFields:
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented
-        names = [each.name for each in fields(self) if each.compare]  # type: ignore[arg-type]
-        return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
+        return all(map(_equal, _held(self), _held(other)))
 
     def __hash__(self) -> int:
-        return hash(tuple(_key(getattr(self, each.name)) for each in fields(self) if each.compare))  # type: ignore[arg-type]
+        return hash(tuple(map(_key, _held(self))))
+
+
+def _held(value: Any) -> list[Any]:
+    """What the fields of a dataclass hold."""
+    return [getattr(value, each.name) for each in fields(value)]
 
 
 def _equal(one: Any, other: Any) -> bool:

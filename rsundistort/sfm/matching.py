@@ -86,8 +86,8 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: In
     asked = combinations(range(len(matched.names)), 2) if pairs is None else np.sort(pairs, axis=1).tolist()
     with quiet_pycolmap().Database.open(matched.database) as db:
         # pycolmap lists no pairs that were found to have none
-        each = sorted({(first, second) for first, second in asked})
-        new = [(first, second) for first, second in each if not db.exists_matches(first + 1, second + 1)]
+        once = sorted({(first, second) for first, second in asked})
+        new = [(first, second) for first, second in once if not db.exists_matches(first + 1, second + 1)]
     kinds = [0] if all(each.kind is None for each in matched.features) else [0, 1]
     matchers = [_matcher_of(matched, kind) for kind in kinds]
     with quiet_pycolmap().Database.open(matched.database) as db:

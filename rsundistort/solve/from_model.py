@@ -303,7 +303,7 @@ def _look_at(
     if by and all(by) and not again:
         raise InputError(f"{folder}: all photos were rectified already, by rsundistort {by[0]}; give the raw ones")
     ours = model.parent
-    if not all(by) and (ours / Record.NAME).is_file() and (ours / "solution.json").is_file():
+    if model.name == "sparse" and not all(by) and (ours / Record.NAME).is_file() and (ours / "solution.json").is_file():
         raise InputError(
             f"{model} shows the rectified photos of {ours}, not those in {folder}; `rsundistort rectify {folder} "
             f"--solution {ours / 'solution.json'} -o OUT` rectifies these with the motions that were found"

@@ -43,7 +43,7 @@ class TrackSources:
     workers: Workers | None
     other: OtherFeatures | None
     always_affine: bool = False
-    # photos of which a search found no motion, and in how large a scene
+    # photos of which a search found no motion, and in how large a scene at most
     _unfound: dict[str, int] = field(init=False, default_factory=dict)
 
     def mapped(self) -> tuple[Reconstruction, TrackSource]:
@@ -72,7 +72,8 @@ class TrackSources:
             self.photos, before, scene, self.other.megapixels, self.other.workers, self.log, phi_sigma=phi_sigma,
             passed_over=[name for name, largest in self._unfound.items() if size <= largest],
         )  # fmt: skip
-        self._unfound.update(dict.fromkeys({*self.photos.names}.difference(scene.image_names, phi), size))
+        for name in {*self.photos.names}.difference(scene.image_names, phi):
+            self._unfound[name] = max(size, self._unfound.get(name, 0))
         return self._without(before, scene, phi, phi) if phi else None
 
     def _without(
