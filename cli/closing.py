@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from math import isfinite
+from math import floor, isfinite, log10
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -158,6 +158,16 @@ def _source(solution: Solution) -> Iterator[tuple[str, str]]:
         yield "video", f"{len(solution.images)} {what} {video['frames']} frames{said}"
 
 
+def _with_sigma(name: str, value: float, sigma: float | None) -> str:
+    """An intrinsic and its standard deviation, with as many decimals as show the first digit of that."""
+    decimals = 4 if name[0] in "kp" else 1
+    if sigma is None or not isfinite(sigma):
+        return f"{name} {value:.{decimals}f}"
+    if sigma > 0:
+        decimals = min(max(decimals, -floor(log10(sigma))), 9)
+    return f"{name} {value:.{decimals}f} +- {sigma:.{decimals}f}"
+
+
 def _lens(solution: Solution) -> Iterator[tuple[str, str]]:
     """Intrinsics that were solved for, with standard deviations; how the lens varies, and what lens models leave."""
     quality = solution.quality
@@ -165,11 +175,7 @@ def _lens(solution: Solution) -> Iterator[tuple[str, str]]:
         sigmas = quality["sigma_intrinsics"].get(keys[0], {})
         (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
         values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **camera.coefficients}
-        found = [
-            f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f}"
-            + (f" +- {sigma:.{4 if name[0] in 'kp' else 1}f}" if sigma is not None and isfinite(sigma) else "")
-            for name, sigma in sigmas.items()
-        ]
+        found = [_with_sigma(name, values[name], sigma) for name, sigma in sigmas.items()]
         for i in range(0, len(found), 3):
             yield _GOES_ON if i else "refined", ", ".join(found[i : i + 3])
     if solution.lens_varied:

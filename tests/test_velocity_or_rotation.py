@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.batch.progress import StageLog
-from rsundistort.bundle import BundleOptions, Posterior, bundle_adjust, choose_model
-from rsundistort.bundle.choice import _rival
+from rsundistort.bundle import BundleOptions, GuessedCameras, Posterior, bundle_adjust, choose_model
+from rsundistort.bundle.choice import _rival, _Selection
 from rsundistort.bundle.doubt import steps_after, steps_to
 from rsundistort.bundle.held_out import ModelFits
 from rsundistort.bundle.model_choice import LEAST_RIVAL
@@ -25,9 +25,9 @@ CAMERA = Camera(768, 512, [[640, 0, 388], [0, 640, 251], [0, 0, 1]])
 NOISE_PX = 0.05
 
 
-def flight(rng, count, drift, rotation=0.003):
-    """Nadir photos over ground of 5 m relief, 40 m below, of a camera that drifts across its readout and shakes."""
-    points_w = np.column_stack([rng.uniform(-35, 35, (1500, 2)), rng.uniform(0, 5, 1500)])
+def flight(rng, count, drift, rotation=0.003, relief=5.0):
+    """Nadir photos over ground of some relief (m), 40 m below, of a camera that drifts across its readout and shakes."""
+    points_w = np.column_stack([rng.uniform(-35, 35, (1500, 2)), rng.uniform(0, relief, 1500)])
     frames, points, xy, R_cw, center_w, phi, velocity = [], [], [], [], [], [], []
     for i in range(count):
         way = 1.0 if i % 2 else -1.0
@@ -52,6 +52,19 @@ def flight(rng, count, drift, rotation=0.003):
     return rec.with_points(np.ones(len(observed), bool), min_track=3)
 
 
+def focused(rng, rec, share):
+    """The same photos, each with a focal length of its own."""
+    obs, (center,) = rec.observations, [each.K[:2, 2] for each in rec.cameras]
+    scale = (1 + rng.normal(0, share, rec.num_images))[obs.frame_idx, None]
+    return replace(rec, observations=replace(obs, xy_raw=center + scale * (obs.xy_raw - center)))
+
+
+def choose_lens(rec):
+    """The choice where the focal length is in the estimate, and may vary."""
+    guessed = GuessedCameras(tuple(rec.cameras), {"f": 1e-3})
+    return choose_model(at_rest(rec), options=BundleOptions(refine=("f",), guessed=guessed), sigma_px=NOISE_PX)
+
+
 def at_rest(rec):
     return replace(rec, phi=np.zeros_like(rec.phi), velocity=np.zeros_like(rec.velocity), shutter_model="global")
 
@@ -74,6 +87,28 @@ def test_a_drift_over_flat_ground_is_not_taken_for_rotations_in_silence(rng, cou
     choice = choose(flight(rng, count, drift=0.5))
     assert choice.shutter == "found"
     assert choice.shutter_model == "constant-motion" or _rival_reasons(choice)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001])
+def test_a_lens_that_focuses_is_seen_beside_a_camera_that_travels(rng, share):
+    choice = choose_lens(focused(rng, flight(rng, 8, drift=0.5, rotation=0.01, relief=20.0), share))
+    assert choice.label == "constant-motion" + ", varying lens" * (share > 0)
+
+
+def test_a_velocity_and_a_lens_that_varies_are_both_kept_where_neither_predicts_better(rng):
+    rec = at_rest(flight(rng, 8, drift=0.1, rotation=0.01, relief=20.0))
+    fits = ModelFits(rec, BundleOptions(), NOISE_PX, 0, None)
+    steady = fits.fit("rotation", False, [fits.given])
+    selection = _Selection(fits, steady, ["global"], {}, refines=True, varying=False)
+    travels, varies = (fits.fit("constant-motion", False, [fits.given]), fits.fit("rotation", True, [fits.given]))
+    for ahead, taken in ((travels, travels), (varies, varies), (None, None)):
+
+        def is_better(before, after, ahead=ahead):
+            return before is steady or after is ahead
+
+        fits.is_better = is_better
+        chosen = selection._or_varying_lens(steady, travels)
+        assert chosen is taken if taken else chosen.label == "constant-motion, varying lens"
 
 
 def test_rotations_of_a_camera_that_stays_have_no_rival(rng):

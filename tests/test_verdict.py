@@ -221,7 +221,10 @@ def test_held_out_measurements_that_are_far_off_speak_against_a_solution(rng):
     far_off = judge(result, None, choice_of("rotation", 10.0, 9.0))
     assert far_off.shutter == "found"
     beyond = f"{3 * result.sigma_px:.1f}"  # sqrt(10 - 1) times the noise
-    assert far_off.reasons == (f"Held-out measurements are off by {beyond} px more than their noise explains.",)
+    assert far_off.reasons == (
+        f"Held-out measurements are off by {beyond} px more than their noise explains; "
+        "exclude what moves, if it is large (--masks).",
+    )
 
 
 def test_a_scene_that_nothing_holds_together_is_not_trusted(rng):
@@ -273,6 +276,17 @@ def test_a_photo_that_moved_far_more_is_doubtful(rng):
     verdict = named(measured(rng, phi))[1]
     assert verdict.doubtful.keys() == {"4.jpg"}
     assert "times as much as the other photos do" in verdict.doubtful["4.jpg"]
+
+
+def test_photos_of_a_camera_that_rests_make_no_photo_of_another_doubtful(rng):
+    phi = swung(rng, 0.03, 12)
+    phi[6:] = rng.normal(0, 1e-5, (6, 3))
+    rec = measured(rng, phi)
+    other = replace(rec, cameras=[*rec.cameras, *rec.cameras], camera_idx=np.repeat([0, 1], 6))
+    assert not named(other)[1].doubtful
+    # nor do photos of the same one that were taken from a tripod
+    phi[6:8] = swung(rng, 0.03, 2)
+    assert not named(measured(rng, phi))[1].doubtful
 
 
 def test_a_photo_that_its_exposure_contradicts_is_doubtful(rng):

@@ -42,8 +42,11 @@ def moved_px(reconstruction: Reconstruction) -> Array:
 class _Selection:
     """The best fit so far, beginning without a shutter; the models that were kept, and reasons against others."""
 
-    def __init__(self, fits: ModelFits, best: ModelFit, kept: list[str], gain: dict[str, float], refines: bool) -> None:
+    def __init__(
+        self, fits: ModelFits, best: ModelFit, kept: list[str], gain: dict[str, float], refines: bool, varying: bool
+    ) -> None:
         self._fits, self._refines = fits, refines
+        self.varying = varying  # whether the lens varies in all shutter models
         self.plain = self.best = best
         self.kept, self.gain = kept, gain
         self.against: list[str] = []
@@ -68,17 +71,29 @@ class _Selection:
             self.against.append(f"{fit.label} removes less of what bends the photos than it leaves")
 
     def _or_varying_lens(self, steady: ModelFit, fit: ModelFit) -> ModelFit:
-        """A velocity beside steady rotations, or a lens that varies in its place, if that predicts better.
+        """A velocity beside steady rotations, or a lens that varies in its place; both if neither predicts better.
 
-        A lens that focuses and a camera that travels both scale and shift what the photo shows.
+        A lens that focuses and a camera that travels both scale and shift what the photo shows. Where the measurements
+        do not tell them apart, both are in the estimate: the spread of what they do not need shrinks to nothing.
         """
         fits = self._fits
         if steady.varying or not self._refines:
             return fit
         vary = fits.fit(steady.model, True, [steady.reconstruction], bends=steady.bends, against=fit)
         self.gain[vary.label] = fits.gain(steady, vary)
-        is_ahead = float(vary.errors.mean()) < float(fit.errors.mean())
-        return vary if is_ahead and fits.is_better(steady, vary) else fit
+        if not fits.is_better(steady, vary) or fits.is_better(vary, fit):
+            return fit
+        if fits.is_better(fit, vary):
+            return vary
+        both = fits.fit(fit.model, True, [fit.reconstruction, vary.reconstruction], bends=fit.bends)
+        self.gain[both.label] = fits.gain(steady, both)
+        return both
+
+    @property
+    def is_lens_open(self) -> bool:
+        """Whether it is still to be tried if the lens of the best varies."""
+        # else that was decided beside a velocity. What a lens that varies would explain may be in poses and points
+        return self._refines and self.best.varying == self.varying
 
     def weigh_velocity(self, fit: ModelFit, steady: ModelFit) -> None:
         """Keep a velocity in place of unsteady rotations, if it predicts better what `steady` ones leave.
@@ -157,7 +172,7 @@ def choose_model(
                 against, agreement = _doubts(fits, best, plain, gain)
             if against:
                 best = plain
-            elif plain.varying:
+            elif selection.is_lens_open:
                 best = _with_shared_lens(fits, best, gain)
                 kept += [best.label] * (best.label not in kept)
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"
@@ -258,7 +273,7 @@ def _selected(fits: ModelFits, models: Sequence[str], refines: bool) -> _Selecti
         alone = fits.fit("rotation", False, [first.reconstruction, given])
         varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
         last = last if varying else first
-    selection, steady = _Selection(fits, plain, kept, gain, refines), last
+    selection, steady = _Selection(fits, plain, kept, gain, refines, varying), last
     if not len(fits.held_out):
         selection.against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     for model in models[1:]:
@@ -270,7 +285,7 @@ def _selected(fits: ModelFits, models: Sequence[str], refines: bool) -> _Selecti
         selection.consider(last)
         steady = last
         if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
-            selection.bend(last)
+            selection.bend(selection.best if selection.best.model == model else last)
             last = selection.best if selection.best.model == model else last
     plainer = _without_bends(fits, selection.best)
     if plainer is not selection.best:

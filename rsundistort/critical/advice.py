@@ -20,6 +20,8 @@ __all__ = ["Advice", "advise", "advise_poses"]
 _TILT_DEG = 20.0
 # An advised photo sees what a given photo sees, if at least this many points stay in it.
 _MIN_POINTS = 20
+# What leaves this share of an uncertainty, or more, is no advice.
+_GAIN = 0.9
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def advise_poses(R_cw: Array, center_w: Array, readout: Sequence[str]) -> list[A
 
 
 def advise(result: BundleResult, options: BundleOptions | None = None) -> list[Advice]:
-    """The gain of a photo rotated by 90 degrees, or of a few tilted by 20, for the given cameras.
+    """The gain of a photo rotated by 90 degrees, or of a few tilted by 20, for the given cameras; of what gains.
 
     The views are added to the solution: each repeats a photo, rotated, with those of its points that stay in it,
     measured as well as the others, and with an equally unknown motion.
@@ -104,7 +106,8 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
     )
     # added views have no residuals: their correlation is taken as that of the given ones
     plain = replace(options or BundleOptions(), deviations="model")
-    worse = shape_cost(result, options).sigma_log_k / shape_cost(result, plain).sigma_log_k
+    now = shape_cost(result, plain)
+    worse = shape_cost(result, options).sigma_log_k / now.sigma_log_k
     found = []
     for what, photos in _candidates(rec.R_cw, rec.center_w, pivots):
         more = rec
@@ -115,6 +118,10 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
             imagined = replace(result, reconstruction=more, covariances=np.zeros((m + len(photos), nb, nb)))
             cost: ShapeCost = shape_cost(imagined, plain)
             shift = cost.common.shift_px if cost.common.of_travel else None
+            gains = [cost.sigma_log_k < _GAIN * now.sigma_log_k]
+            gains += [cost.common.shift_px < _GAIN * now.common.shift_px] * (shift is not None)
+            if not any(gains):
+                continue
             found.append(Advice(what, cost.degeneracy.value, worse * cost.sigma_log_k, shift))
     return found
 

@@ -58,7 +58,7 @@ class ShapeCost:
         if not np.isfinite(self.sigma_log_k):
             return "the height of the scene is not determined: the measurements leave it entirely open"
         percent = 100 * self.sigma_log_k
-        value = f"{percent:.{2 if percent < 1 else 1}f}"
+        value = f"{percent:.2g}" if percent < 0.1 else f"{percent:.{2 if percent < 1 else 1}f}"
         said = f"the height of the scene is uncertain by +-{value} % (one standard deviation)"
         if not self.is_flagged:
             return said

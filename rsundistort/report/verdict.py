@@ -170,7 +170,7 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
         degeneracy = degeneracy_of(solution)
         why = "the cameras were rotated enough against each other to separate the shutter from the shape"
         if degeneracy is not None and degeneracy.is_low:
-            why = f"although {_level(degeneracy)}, the measurements determine its height"
+            why = f"although {_level(degeneracy)}, its height is determined"
         return "trust", "The shape can be trusted", f"The shape of the scene can be trusted: {why}. {sentence}"
     text = " ".join(reasons)
     if shutter == "not-determined":

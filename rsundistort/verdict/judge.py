@@ -45,6 +45,8 @@ _LEAST_HELD_OUT = 30
 # A photo is doubtful if its motion is this many times the prior standard deviation, if it has this few measurements, if
 # these cover this share of its frame, or with this share of outliers.
 _FAR = 5.0
+# Upper quartile of the largest of three normal components, in their standard deviations.
+_UPPER_QUARTILE = 1.69
 _FEW = 2 * LEAST_MEASUREMENTS
 _CORNER = 1 / 16
 _OUTLIERS = 1 / 3
@@ -254,7 +256,10 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
                 "five periods a frame, or the photos were stabilised line by line."
             )
         if error > 2.0 and beyond_px > _HELD_OUT_PX:
-            reasons.append(f"Held-out measurements are off by {beyond_px:.1f} px more than their noise explains.")
+            reasons.append(
+                f"Held-out measurements are off by {beyond_px:.1f} px more than their noise explains; exclude what "
+                "moves, if it is large (--masks)."
+            )
     return reasons
 
 
@@ -324,9 +329,10 @@ def _of_motions(
         )
     if (axis := _repeated(rec, options)) is not None and not {*known}.issuperset(rec.image_names):
         rotation = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
+        travel = "" if rec.shutter_model == "constant-motion" else ", or a camera that travels over flat ground"
         reasons.append(
-            f"All photos appear to have rotated alike, by {abs(rotation):.2f} degrees about {'xyz'[axis]}: an error of "
-            "the lens looks like that, and no hand moves so."
+            f"All photos appear to have rotated alike, by {abs(rotation):.2f} degrees about {'xyz'[axis]}, as no hand "
+            f"does: an error of the lens looks like that{travel}{' (--model constant-motion)' if travel else ''}."
         )
     by_known = None if choice is None else choice.known_motions
     if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
@@ -406,7 +412,7 @@ def _doubts(
     rec = result.reconstruction
     rotation = rec.phi * rec.frame_span()[:, None]
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
-    times = np.abs(rotation).max(1) / result.phi_rms
+    times = _times_usual(rec, result.phi_rms)
     counts = _counts(rec)
     doubts: dict[str, list[str]] = {}
     for i, name in enumerate(rec.image_names):
@@ -430,6 +436,21 @@ def _doubts(
                 f"blurred by more than {np.degrees(most):.2f}"
             )
     return doubts
+
+
+def _times_usual(rec: Reconstruction, phi_rms: float) -> Array:
+    """(m,) size of each photo's rotation in standard deviations of all, or of the others of its camera if larger.
+
+    A camera without a shutter makes the standard deviation of all small, and photos taken from a tripod make that of
+    their camera small: so of a camera, it is that whose largest component the upper quartile of its photos have.
+    """
+    size = (np.abs(rec.phi) * rec.frame_span()[:, None]).max(1)
+    usual = np.full(rec.num_images, phi_rms)
+    for i, camera in enumerate(rec.camera_idx):
+        others = np.flatnonzero((rec.camera_idx == camera) & (np.arange(rec.num_images) != i))
+        if len(others):
+            usual[i] = max(phi_rms, np.quantile(size[others], 0.75) / _UPPER_QUARTILE)
+    return size / usual
 
 
 def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
