@@ -26,7 +26,7 @@ NOISE_PX = 0.05
 
 
 def flight(rng, count, drift, rotation=0.003, relief=5.0):
-    """Nadir photos over ground of some relief (m), 40 m below, of a camera that drifts across its readout and shakes."""
+    """Nadir photos over ground of some relief in m, 40 below, of a camera that drifts across its readout and shakes."""
     points_w = np.column_stack([rng.uniform(-35, 35, (1500, 2)), rng.uniform(0, relief, 1500)])
     frames, points, xy, R_cw, center_w, phi, velocity = [], [], [], [], [], [], []
     for i in range(count):
