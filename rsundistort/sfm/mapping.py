@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -105,8 +106,7 @@ def _with_more(best: Reconstruction | None, other: Reconstruction | None) -> Rec
 
 def _mapped_at_once(matched: MatchedPhotos, limit: int | None, shown: MatchedPhotos | None) -> Reconstruction | None:
     """What the global mapper registers by the largest keypoints, without photos that hang on by few measurements."""
-    work = matched.database.parent / f"mapping-global-{limit}"
-    work.mkdir()
+    work = Path(mkdtemp(prefix="mapping-", dir=matched.database.parent))
     options = _global_options(matched)
     models = quiet_pycolmap().global_mapping(_mapping_database(matched, work, limit), work, work, options)
     return _firmly_connected(_largest(models.values()), shown or matched)
@@ -172,8 +172,7 @@ def _best_model(
             if progress is not None:
                 progress(min(registered[0], total))
 
-        work = matched.database.parent / f"mapping-{matched.calibrated}-{number}"
-        work.mkdir()
+        work = Path(mkdtemp(prefix="mapping-", dir=matched.database.parent))
         models = pycolmap.incremental_mapping(
             _mapping_database(matched, work, limit),
             work,

@@ -22,15 +22,15 @@ from ..sfm.database import without_motions
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, close_px, match_more
 
-__all__ = ["match_without_motions", "place_photos"]
+__all__ = ["OF_CLIP", "match_without_motions", "place_photos"]
 
 # Verified matches of a pair that overlaps, beyond doubt.
 _MANY = 100
 # Verified matches of a pair with which coarse features do. With more photos than `_ASKED`, so many pairs in their order
 # are asked before all are matched, of which most must have that; each photo then has half of it at least.
 _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
-# Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
-_OF_CLIP = (512, 2048, None)
+#: Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
+OF_CLIP = (512, 2048, None)
 
 
 def place_photos(
@@ -77,7 +77,7 @@ def place_photos(
     mapped: Reconstruction | None = kept.get(key)
     if mapped is None:
         try:
-            keypoints = _OF_CLIP if of_clip else PLACING_KEYPOINTS
+            keypoints = OF_CLIP if of_clip else PLACING_KEYPOINTS
             mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)), keypoints)
         except ReconstructionError as error:
             overlapping = sum(count >= _MANY for count in read_num_verified(matched).values())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
+from ..bundle.held_out import MIN_FALL
 from ..bundle.own_motions import OwnMotions, own_motions
 from ..bundle.path_prior import FramePath, PathPrior, PathStart
 from ..errors import InputError, ReconstructionError, RsUndistortWarning
@@ -20,19 +21,19 @@ from ..input.load import LoadedPhotos
 from ..input.stabilisation import Stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
-from ..model import Reconstruction, opposite
-from ..sfm import MatchedPhotos, retriangulate
+from ..model import Camera, Reconstruction, opposite
+from ..sfm import MatchedPhotos, map_photos, retriangulate
 from ..verdict.judge_path import SIGMAS
 from .clip_direction import likely_directions, read_along
 from .clip_gyroscope import felt_gyroscope, own_gyroscope, readout_of
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
 from .clip_stabilisation import as_filmed, was_stabilised
-from .clip_tracks import focused_as, follow_points, followed_again, with_all_frames
+from .clip_tracks import Followed, focused_as, follow_points, followed_again, with_all_frames
 from .clip_verdict import FoundPath, judged
 from .missing_frames import tell_of_gaps, with_gaps
 from .outcome import Solved
-from .placing import place_photos
+from .placing import OF_CLIP, place_photos
 from .shaking import held_by_slow_rotations, tell_if_held
 from .tracks import rough_options, tell
 
@@ -57,6 +58,9 @@ _ROUGH_COST = 1e-4
 # A focal length changes from frame to frame, by focusing or zooming, if a first adjustment finds it to vary by more
 # (relative standard deviation). That one does not know the path well yet: where the lens stays it finds up to 2.4e-4.
 _FOCUSES = 5e-4
+# A scene is mapped again by the focal length that its path found, and a path is found again, if focal lengths differ by
+# these shares; so many times.
+_MAPPED_BY, _SOLVED_BY, _LENS_ROUNDS = 0.05, 0.03, 3
 # Standard deviation of a readout time, as a share of the time between frames, that no false axis of it leaves.
 _CLEAR = 0.01
 # Relative standard deviation of a readout time that is specified, or from the table.
@@ -279,46 +283,130 @@ def _travelled(
 ) -> FoundPath:  # fmt: skip
     """The path of a camera that travels, from the scene of its key frames, mapped as of a global shutter."""
     mapped, matched = placed()
-    result: BundleResult | None = None
-    filmed: Stabilisation | None = None
+    found = _first_path(clip, path, options_of, log, telemetry, mapped, matched)
+    # in a scene that was mapped by a wrong lens frames bend as by a shutter
+    for _ in range(_LENS_ROUNDS):
+        if matched.calibrated or not _is_other_lens(found.result, mapped.cameras[0], _MAPPED_BY):
+            break
+        log.begin("mapping again")
+        try:
+            lens = found.result.reconstruction.cameras
+            mapped = map_photos(replace(matched, cameras=lens, calibrated=True), keypoints=OF_CLIP)
+        except ReconstructionError:
+            break
+        finally:
+            log.end("mapping again", photos=mapped.num_images)
+        other = _first_path(clip, path, options_of, log, telemetry, mapped, matched)
+        if not other.result.sigma_px < found.result.sigma_px:
+            break
+        found = other
+    for _ in range(_LENS_ROUNDS):
+        before = found.result.reconstruction.cameras[0]
+        found = _path_again(found, options_of, log, matched)
+        # what was an outlier by one lens is none by another
+        if matched.calibrated or not _is_other_lens(found.result, before, _SOLVED_BY):
+            break
+    return FoundPath(found.clip, found.result, found.options, found.filmed)
+
+
+@dataclass(frozen=True)
+class _TravelledPath:
+    """A path, and what it was found from.
+
+    Attributes
+    ----------
+    clip, path
+        The clip and its path, with other times where frames are missing.
+    options : BundleOptions
+        Of its adjustment, with the path as it was held.
+    filmed : Stabilisation, optional
+        Whether frames are as they were read.
+    result : BundleResult
+        Of all frames.
+    scene, followed
+        The key frames, as of a global shutter, and what of them was followed.
+    """
+
+    clip: Clip
+    path: FramePath
+    options: BundleOptions
+    filmed: Stabilisation | None
+    result: BundleResult
+    scene: Reconstruction
+    followed: Followed
+
+
+def _first_path(
+    clip: Clip, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
+    log: StageLog, telemetry: GyroLog | None, mapped: Reconstruction, matched: MatchedPhotos,
+) -> _TravelledPath:  # fmt: skip
+    """The path through all frames, from the scene of its key frames."""
     # the lens would absorb a shutter that is not modelled yet
     rough = rough_options(replace(options_of(mapped), refine=()))
-    current = bundle_adjust(mapped, "global", rough).reconstruction
+    scene = bundle_adjust(mapped, "global", rough).reconstruction
     log.begin("flow")
-    followed = follow_points(clip, current)
+    followed = follow_points(clip, scene)
     log.end("flow", observations=len(followed.frame))
-    for stage in ("path", "path again"):
-        log.begin(stage)
-        on_path = None if result is None else result.reconstruction
-        whole = with_all_frames(clip, current, followed, on_path).without_photos(_LEAST_MEASUREMENTS)
-        if on_path is not None:
-            whole = focused_as(on_path, whole)
-        if on_path is None:
-            own = own_motions(whole)
-            clip, path = with_gaps(clip, path, whole, own)
-            path, filmed = as_filmed(clip, whole, path, telemetry, own)
-            held = path if was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
-        elif held.held_sigma or not (was_stabilised(filmed) or clip.is_even):  # by what is better known now
-            held = held_by_slow_rotations(clip, on_path, path, own_motions(on_path))
-        options, is_first = replace(options_of(whole), path=held), result is None
-        if result is None:
-            # a camera that nobody knows would take the lines' rotations for its lens; mapping refined it
-            how = _at_first(options if matched.calibrated else replace(options, refine=()))
-        else:
-            options = _if_it_focuses(replace(options, path=replace(held, start=result.path_start())), result)
-            how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
-        result = bundle_adjust(whole, "constant-motion", how, partial(tell, log, stage))
-        log.end(
-            stage, frames=whole.num_images, of_frames=len(clip.names), rms_px=result.rms_px,
-            iterations=result.num_iterations, readout_s=readout_of(result).seconds, stop_reason=result.stop_reason,
-        )  # fmt: skip
-        if is_first:
-            # key frames without shutter: measurements that it had torn from their tracks return
-            before, of_keys = current, result.of_photos(clip.are_keys(result.reconstruction.image_names)).reconstruction
-            current = retriangulate(matched, of_keys)
-            followed = followed_again(clip, followed, before, current)
-    assert result is not None
-    return FoundPath(clip, result, options, filmed)
+    log.begin("path")
+    whole = with_all_frames(clip, scene, followed).without_photos(_LEAST_MEASUREMENTS)
+    own = own_motions(whole)
+    clip, path = with_gaps(clip, path, whole, own)
+    path, filmed = as_filmed(clip, whole, path, telemetry, own)
+    held = path if was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
+    options = replace(options_of(whole), path=held)
+    if matched.calibrated:
+        result = bundle_adjust(whole, "constant-motion", _at_first(options), partial(tell, log, "path"))
+    else:
+        result = _with_unknown_lens(whole, _at_first(options), log)
+    _end_path(log, "path", clip, whole, result)
+    return _TravelledPath(clip, path, options, filmed, result, scene, followed)
+
+
+def _path_again(
+    first: _TravelledPath, options_of: Callable[[Reconstruction], BundleOptions], log: StageLog, matched: MatchedPhotos
+) -> _TravelledPath:
+    """The path once more, with measurements that the shutter, or a wrong lens, had torn from their tracks."""
+    result, clip, held = first.result, first.clip, first.options.path
+    assert held is not None
+    on_path = result.reconstruction
+    # key frames without shutter
+    scene = retriangulate(matched, result.of_photos(clip.are_keys(on_path.image_names)).reconstruction)
+    followed = followed_again(clip, first.followed, first.scene, scene)
+    log.begin("path again")
+    whole = focused_as(on_path, with_all_frames(clip, scene, followed, on_path).without_photos(_LEAST_MEASUREMENTS))
+    if held.held_sigma or not (was_stabilised(first.filmed) or clip.is_even):  # by what is better known now
+        held = held_by_slow_rotations(clip, on_path, first.path, own_motions(on_path))
+    options = _if_it_focuses(replace(options_of(whole), path=replace(held, start=result.path_start())), result)
+    how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
+    result = bundle_adjust(whole, "constant-motion", how, partial(tell, log, "path again"))
+    _end_path(log, "path again", clip, whole, result)
+    return replace(first, options=options, result=result, scene=scene, followed=followed)
+
+
+def _with_unknown_lens(whole: Reconstruction, options: BundleOptions, log: StageLog) -> BundleResult:
+    """A path by a focal length of all frames; then by one that varies, if that explains them better.
+
+    One that varies at once makes up for a wrong one, frame by frame. The rest of the lens is mapping's as yet: it would
+    take the lines' rotations for itself.
+    """
+    options = replace(options, refine=("f",))
+    steady = bundle_adjust(whole, "constant-motion", replace(options, varying=False), partial(tell, log, "path"))
+    assert options.path is not None
+    options = replace(options, path=replace(options.path, start=steady.path_start()))
+    varying = bundle_adjust(steady.reconstruction, "constant-motion", options, partial(tell, log, "path"))
+    return varying if varying.sigma_px**2 < (1 - MIN_FALL) * steady.sigma_px**2 else steady
+
+
+def _is_other_lens(found: BundleResult, assumed: Camera, tolerance: float) -> bool:
+    """Whether a scene would be another one by the focal length that its path found."""
+    return bool(abs(np.log(found.reconstruction.cameras[0].K[0, 0] / assumed.K[0, 0])) > tolerance)
+
+
+def _end_path(log: StageLog, stage: str, clip: Clip, whole: Reconstruction, result: BundleResult) -> None:
+    log.end(
+        stage, frames=whole.num_images, of_frames=len(clip.names), rms_px=result.rms_px,
+        iterations=result.num_iterations, readout_s=readout_of(result).seconds, stop_reason=result.stop_reason,
+    )  # fmt: skip
 
 
 def _at_first(options: BundleOptions) -> BundleOptions:
