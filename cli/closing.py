@@ -92,7 +92,7 @@ def closing_table(solution: Solution, out: Path) -> str:
     # a text without a label is indented below the line above
     lines = [table(rows), "", *(f"{label:<{_LABEL}}{text}" if label else f"  {text}" for label, text in facts)]
     critical, said = solution.critical_motion or {}, [verdict.sentences[2]]
-    if critical.get("flagged"):
+    if critical.get("flagged") and not all(image.lens_only for image in solution.registered):
         # the same but for its capital
         said += [critical["sentence"]] * (critical["sentence"][1:] not in said[0])
         said += ["at the next shoot:", *critical["advice"]] if critical["advice"] else []

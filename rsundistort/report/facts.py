@@ -100,7 +100,7 @@ def readout_facts(evidence: Mapping[str, Any]) -> list[tuple[str, str]]:
     # the ground truth of a clip has no share
     share = f" ({evidence['of_frame']:.2f} of the frame)" if "of_frame" in evidence else ""
     # a time that was known before need not follow from the video
-    problem = "" if source.startswith("what") else problem_of(evidence)
+    problem = "" if source.startswith("what was") else problem_of(evidence)
     facts = [("readout time", f"not measured: {problem}" if problem else f"{_time(evidence)}{share}, {origin}")]
     halves = evidence.get("halves") or ()
     if halves:

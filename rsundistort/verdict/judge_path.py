@@ -11,6 +11,7 @@ from ..bundle import BundleResult
 from ..bundle.own_motions import OwnMotions
 from ..critical import Remedy
 from ..model import Reconstruction
+from ..model.reprojection import shutter_displacements
 from ..rectify import largest_shift_px
 from .judge import UNSEEN_PX, Verdict, height_reasons, loose_reasons, unexplained_reasons
 from .speeds import BySpeed, ReadoutTime
@@ -29,6 +30,8 @@ _SHOWN_FAST = 0.5
 _GYRO_SCALE = 0.05
 # Of the time from frame to frame: a readout time that ends at it, and is known no better, is not measured.
 _KNOWN = 0.1
+# Of all measurements, those that are displaced by less than what counts as seen: a few points may be wrong.
+_SHARE_SHOWN = 0.95
 # Where a path misses part of how fast its camera rotates, the readout time comes out longer.
 _TOO_FEW = "the camera shakes too fast for its frame rate, or frames are missing or came twice"
 _VIBRATES = "the camera vibrates faster than half of the frame rate, or something else bends the frames"
@@ -85,9 +88,15 @@ def judge_clip(
     reasons = loose_reasons(keys, scaled=True) + height_reasons(remedy) + unexplained_reasons(keys, None)
     rec = keys.reconstruction
     shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
+    # travel displaces what is near
+    moved, valid = shutter_displacements(rec)
+    if valid.any():
+        shift = max(shift, float(np.quantile(np.linalg.norm(moved[valid], axis=1), _SHARE_SHOWN)))
     most = shift * (abs(time.seconds) + SIGMAS * time.sigma) / max(abs(time.seconds), 1e-9)
     if against:
-        return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
+        return Verdict(
+            "not-determined", "doubtful", (f"{against[0].upper()}{against[1:]}.", *reasons), {}, tuple(rec.image_names)
+        )
     if not most > UNSEEN_PX:
         shutter = "not-found"
     elif _is_too_long(unbounded_s, time.sigma, frame_s):

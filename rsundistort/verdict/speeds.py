@@ -29,6 +29,8 @@ _MORE = 1.1
 _LEAST_PERIODS = 2
 # A Hann window spreads each rotation over three frequencies: what is left of neighbours goes together.
 _TOGETHER = 1.5
+# Standard deviations of the noise's power beyond which lines show what frames do not.
+_BEYOND = 3.0
 
 
 class ReadoutTime(NamedTuple):
@@ -47,7 +49,7 @@ class BySpeed(NamedTuple):
         The readout times by them; None if that kind of rotation is lost in the noise.
     unfollowed : float
         Share of the power of the lines' rotations that is not in those of the frames at the readout time by slow ones,
-        beyond the noise of both: 0 if they agree, 1 or more if they have nothing to do with each other.
+        significantly beyond the noise of both: 0 if they agree, 1 or more if they have nothing to do with each other.
     """
 
     slow: ReadoutTime | None
@@ -159,7 +161,10 @@ def _compared(runs: Sequence[_Run], readout_s: float, step_s: float) -> BySpeed:
         _slope(lines[mine], rates[mine], line_noise[mine], rate_noise[mine], readout_s) for mine in (~fast, fast)
     )
     by_slow = 0.0 if slow is None else slow.seconds
-    left = float((np.abs(lines - by_slow * rates) ** 2 - by_slow**2 * rate_noise - line_noise).sum())
+    noise = by_slow**2 * rate_noise + line_noise
+    left = float((np.abs(lines - by_slow * rates) ** 2 - noise).sum())
+    # of frames that hardly rotate the noise alone leaves a share; its power at a frequency scatters by itself
+    left -= min(max(left, 0.0), _BEYOND * float(np.sqrt(_TOGETHER * (noise**2).sum())))
     power = float((np.abs(lines) ** 2).sum()) - float(line_noise.sum())
     return BySpeed(slow, rest, left / power if power > line_noise.sum() else 0.0)
 
