@@ -49,6 +49,16 @@ def shaken(seed, hz, size):
     return rotations
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_of_frames_that_hardly_rotate_is_no_shaking(seed):
+    def rotations(time_s):
+        return Rotation.from_rotvec(
+            0.05 * Rotation.from_matrix(HandHeld(seed).rotations(time_s)).as_rotvec()
+        ).as_matrix()
+
+    assert by_speed(rotations, np.random.default_rng(seed), num=48).unfollowed < 0.1
+
+
 @pytest.mark.parametrize("readout_s", [0.008, 0.02, 0.03])
 @pytest.mark.parametrize("hz", [9.0, 12.5])
 def test_slow_and_fast_rotations_of_a_hand_ask_for_the_same_readout_time(rng, readout_s, hz):

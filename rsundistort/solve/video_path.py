@@ -392,7 +392,8 @@ def _with_unknown_lens(whole: Reconstruction, options: BundleOptions, log: Stage
     options = replace(options, refine=("f",))
     steady = bundle_adjust(whole, "constant-motion", replace(options, varying=False), partial(tell, log, "path"))
     assert options.path is not None
-    options = replace(options, path=replace(options.path, start=steady.path_start()))
+    # both at once run away: a scene that zooms in may as well come nearer
+    options = replace(options, refine=(), path=replace(options.path, start=steady.path_start()))
     varying = bundle_adjust(steady.reconstruction, "constant-motion", options, partial(tell, log, "path"))
     return varying if varying.sigma_px**2 < (1 - MIN_FALL) * steady.sigma_px**2 else steady
 
