@@ -217,11 +217,11 @@ def _only_rotated(
         rough = replace(options, refine=()) if said else options
         result, own, clip, path = _rotated_in_time(clip, path, start, rough, log)
         if own is not None:
-            path = held_by_slow_rotations(clip, result.reconstruction, path, own)
-            options = _if_it_focuses(replace(options, path=path), result)
-            how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
-            how = replace(how, path=replace(path, start=result.path_start()))
-            result = bundle_adjust(result.reconstruction, "constant-motion", how, partial(tell, log, "rotations"))
+            held = held_by_slow_rotations(clip, result.reconstruction, path, own)
+            result, options = _rotated_again(result, replace(options, path=held), log)
+            # what a rough path does not follow, a better one may
+            if held.held_sigma and not _is_held(clip, path, result):
+                result, options = _rotated_again(result, replace(options, path=path), log)
             dropped = 1 - len(result.reconstruction.observations) / len(start.observations)
             found, explained = FoundPath(clip, result, options), result.sigma_px < _FLOW_PX and dropped < _OUTLIERS
     log.end("rotations", explained=explained)
@@ -248,6 +248,22 @@ def _rotated_in_time(
         if rounds == _GAP_ROUNDS or np.array_equal(timed[0].time_s, clip.time_s):
             return result, own, clip, path
         (clip, path), rounds = timed, rounds + 1
+
+
+def _rotated_again(before: BundleResult, options: BundleOptions, log: StageLog) -> tuple[BundleResult, BundleOptions]:
+    """The last adjustment of frames that only rotate, from one before, and its options."""
+    options = _if_it_focuses(options, before)
+    assert options.path is not None
+    how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
+    how = replace(how, path=replace(options.path, start=before.path_start()))
+    told = partial(tell, log, "rotations")
+    return bundle_adjust(before.reconstruction, "constant-motion", how, told), options
+
+
+def _is_held(clip: Clip, path: FramePath, result: BundleResult) -> bool:
+    """Whether frames that only rotate shake faster than a path through them follows."""
+    own = own_motions(result.reconstruction, rotation_only=True)
+    return held_by_slow_rotations(clip, result.reconstruction, path, own).held_sigma > 0
 
 
 def _shows_readout(found: FoundPath) -> bool:
