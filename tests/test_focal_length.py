@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from rsundistort import Camera, read_solution
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
-from rsundistort.errors import ReconstructionError, RsUndistortWarning
+from rsundistort.errors import ReconstructionError
 from rsundistort.input.load import load_photos
 from rsundistort.input.photo_cameras import PhotoCameras
-from rsundistort.input.unknown_focal import with_focal_lengths
+from rsundistort.input.unknown_focal import warn_of_weak_focal_lengths, with_focal_lengths
 from rsundistort.sfm import USUAL_FOCAL, estimate_focal_length
 
 SIZE = (1280, 960)
@@ -96,13 +95,21 @@ def test_the_focal_length_of_photos_without_one_is_found_and_said(photos):
     log = StageLog(None)
     loaded = load_photos(photos, None, None, 2000, Workers(1), log)
     assert loaded.cameras.without_focal == [0]
-    with warnings.catch_warnings():  # of so strong a shutter, pairs hardly determine it
-        warnings.simplefilter("ignore", RsUndistortWarning)
-        found = with_focal_lengths(loaded, 0, log).cameras
+    found = with_focal_lengths(loaded, 0, log).cameras
     (camera,), (sigma,) = found.cameras, found.known_to(loose=False).sigmas
     assert abs(np.log(camera.K[0, 0] / 400.0)) < 2.5 * sigma["f"]
     assert "give --camera if you know it" in found.notes[-1]
     assert not found.calibrated
+
+
+@pytest.mark.parametrize(("sigmas", "said"), [({"f": 4.0}, False), ({"f": 40.0}, True), ({}, True)])
+def test_a_focal_length_is_called_weak_if_the_solution_leaves_it_so(recwarn, sigmas, said):
+    guess = Camera(320, 240, [[272.0, 0, 159.5], [0, 272.0, 119.5], [0, 0, 1]])
+    cameras = PhotoCameras([guess], ["a"], np.zeros(3, int), False, (False,), "", sigma=[{"f": 0.3}], without_focal=[0])
+    warn_of_weak_focal_lengths(cameras, [guess], [sigmas])
+    assert [str(each.message).startswith("the photos hardly determine") for each in recwarn] == [True] * said
+    warn_of_weak_focal_lengths(replace(cameras, without_focal=[]), [guess], [{"f": 100.0}])
+    assert len(recwarn) == said
 
 
 @pytest.mark.parametrize(

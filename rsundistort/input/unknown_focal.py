@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,14 +12,16 @@ from ..batch.progress import StageLog
 from ..errors import RsUndistortWarning
 from ..io.kept import Kept
 from ..io.outputs import work_folder
+from ..model import Camera
 from ..sfm import choose_pairs, global_descriptors
 from ..sfm.epipolar import read_verified
 from ..sfm.focal_length import FocalLength, estimate_focal_length
 from ..sfm.matching import match_photos
 from .load import LoadedPhotos
 from .pairing import capture_sequences, places_of
+from .photo_cameras import PhotoCameras
 
-__all__ = ["with_focal_lengths"]
+__all__ = ["warn_of_weak_focal_lengths", "with_focal_lengths"]
 
 # Number of features of a photo, the largest, and of pairs of each camera that are used.
 _FEATURES, _PAIRS = 4096, 30
@@ -26,8 +29,8 @@ _FEATURES, _PAIRS = 4096, 30
 _LEAST_MATCHES = 60
 # Threshold of fundamental matrices, in pixels of the image that the features were detected in: a shutter bends by some.
 _WITHIN_PX = 4.0
-# Focal lengths with a larger standard deviation count as unknown.
-_WEAK = 0.2
+# Relative standard deviation of a focal length that the solution should have found better.
+_WEAK = 0.05
 
 
 def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kept | None = None) -> LoadedPhotos:
@@ -51,12 +54,29 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
         by = f"by {focal.num_pairs} pairs of them" if focal.num_pairs else "as is usual"
         value = f"{focal.pixels:.0f} px (+-{100 * focal.sigma:.0f} %) {by}"
         said.append(f"no focal length in the photos of {cameras.labels[k]}: {value}; give --camera if you know it")
-        if focal.sigma > _WEAK:
-            text = f"the photos hardly determine their focal length: {said[-1]}"
-            warnings.warn(text, RsUndistortWarning, stacklevel=3)
     source = "found from the photos, refined" if len(found) == len(new) else cameras.source
     known = replace(cameras, cameras=tuple(new), sigma=sigma, source=source, notes=[*cameras.notes, *said])
     return replace(photos, cameras=known)
+
+
+def warn_of_weak_focal_lengths(
+    cameras: PhotoCameras, solved: Sequence[Camera], sigmas: Sequence[Mapping[str, float]]
+) -> None:
+    """Warn of cameras without a focal length whose photos, all together, hardly determine it.
+
+    Parameters
+    ----------
+    cameras : PhotoCameras
+        With focal lengths from pairs, and their relative standard deviations.
+    solved, sigmas
+        The same cameras as solved, and standard deviations of their intrinsics in pixels, where these were refined.
+    """
+    for k in cameras.without_focal:
+        focal = float(solved[k].K[0, 0])
+        sigma = sigmas[k].get("f", focal * cameras.sigma[k].get("f", 0.0)) if k < len(sigmas) else 0.0
+        if sigma > _WEAK * focal:
+            said = f"{focal:.0f} +- {sigma:.0f} px; give --camera if you know it"
+            warnings.warn(f"the photos hardly determine their focal length: {said}", RsUndistortWarning, stacklevel=3)
 
 
 def _focal_length(photos: LoadedPhotos, camera: int, seed: int) -> FocalLength:

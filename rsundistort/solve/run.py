@@ -19,7 +19,7 @@ from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_readout
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos, OtherFeatures, load_photos
 from ..input.photo_cameras import camera_file_of
-from ..input.unknown_focal import with_focal_lengths
+from ..input.unknown_focal import warn_of_weak_focal_lengths, with_focal_lengths
 from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
@@ -173,6 +173,7 @@ def _solved(
         solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log, kept)
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
+    warn_of_weak_focal_lengths(loaded.cameras, solved.result.reconstruction.cameras, solved.result.sigma_intrinsics)
     facts: dict[str, Any] = {} if is_clip else {"features": options.features}
     facts |= {
         "max_features": options.most_features(is_clip),
