@@ -45,6 +45,12 @@ def _frozen(frames: Frames) -> Frames:
     return [*frames[:half], *[frames[half]] * 40, *frames[half:]]
 
 
+def _twice(frames: Frames) -> Frames:
+    """Some frames, as a recorder that could not keep up wrote them, show the one before."""
+    late = {4, 9, 17, 20, 26}
+    return [frames[k - 1] if k % 31 in late else frame for k, frame in enumerate(frames)]
+
+
 def _passers_by(frames: Frames) -> Frames:
     """Four that cover up to a fifth of the frame."""
     height, width = frames[0].shape[:2]
@@ -137,12 +143,14 @@ EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
     "focusing": (_focusing, 1.0),
     "zoom": (_cropped, 1.0),
     "no camera": (lambda frames: frames, 1.0),
+    "some twice, no camera": (_twice, 1.0),
+    "focusing, no camera": (_focusing, 1.0),
     "upright": (lambda frames: [cv2.rotate(frame, cv2.ROTATE_90_CLOCKWISE) for frame in frames], 1.0),
     "backwards": (lambda frames: frames[::-1], 1.0),
 }
 
 #: Edits after which nobody knows the camera.
-OF_NO_CAMERA = ("no camera", "upright")
+OF_NO_CAMERA = ("no camera", "some twice, no camera", "focusing, no camera", "upright")
 
 
 def edited(video: Path, out: Path, edit: str) -> None:

@@ -366,6 +366,12 @@ def edits(args: argparse.Namespace) -> None:
             for key, each in of.items():
                 said[f"{key}_error_percent"] = round(100 * (each["seconds"] / true_s - 1), 2)
                 said[f"{key}_error_over_sigma"] = round((each["seconds"] - true_s) / each["sigma"], 2)
+            if camera is None:
+                (true,) = read_solution(folder / "ground_truth.json").cameras.values()
+                true_px, focal_px = (float(each.K[0, 0]) for each in (true, solved.result.reconstruction.cameras[0]))
+                sigma_px = solved.result.sigma_intrinsics[0]["f"]
+                said["focal_error_percent"] = round(100 * (focal_px / true_px - 1), 2)
+                said["focal_error_over_sigma"] = round((focal_px - true_px) / sigma_px, 2)
             said |= {"verdict": [verdict.shutter, verdict.shape], "reasons": verdict.reasons}
             print(json.dumps(said), flush=True)
 
