@@ -142,7 +142,8 @@ def choose_model(
     still remove, and be better than itself read along the other axis (other causes that bend photos fit either axis),
     and two halves of the scene must show the same motions; unless motions that are known from elsewhere, none of them
     fitted, predict better than none. Beside rotations, the one of a velocity and a lens that varies is kept that
-    predicts better. Last comes a residual field of each camera, where something smooth is left.
+    predicts better, or both if neither does; and a lens that varies is tried beside the shutter that is kept. Last
+    comes a residual field of each camera, where something smooth is left.
 
     Parameters
     ----------

@@ -69,7 +69,8 @@ def warn_of_weak_focal_lengths(
     cameras : PhotoCameras
         With focal lengths from pairs, and their relative standard deviations.
     solved, sigmas
-        The same cameras as solved, and standard deviations of their intrinsics in pixels, where these were refined.
+        The same cameras, in this order, as solved; and standard deviations of their intrinsics in pixels, empty where
+        these were not refined.
     """
     for k in cameras.without_focal:
         focal = float(solved[k].K[0, 0])
