@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from clips import HandHeld, filmed
 
+from rsundistort import Camera
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, GuessedCameras, bundle_adjust
 from rsundistort.bundle.path_prior import FramePath
-from rsundistort.solve.video_path import _at_first, _is_other_lens, _with_unknown_lens
+from rsundistort.errors import ReconstructionError
+from rsundistort.solve import video_path
+from rsundistort.solve.video_path import _at_first, _is_other_lens, _travelled, _with_unknown_lens
 
 FRAME_S = 1 / 30
 
@@ -40,3 +44,69 @@ def test_a_lens_that_zooms_varies_where_its_focal_length_is_wrong_too():
     result, _ = first_adjustment(zoom)
     assert 0.03 < result.focal_sigma < 0.3
     assert np.corrcoef(result.reconstruction.variation[:, 0], zoom)[0, 1] > 0.8
+
+
+def of_lens(f):
+    return SimpleNamespace(cameras=[Camera(64, 48, np.diag([f, f, 1.0]))], num_images=8)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matches of photos of some lens."""
+
+    calibrated: bool
+    cameras: object = None
+
+
+@pytest.fixture
+def clip_of(monkeypatch):
+    """What `_travelled` maps, and the focal length that it ends with, by what paths find and how well they fit."""
+
+    def clip_of(first_paths, last_paths, calibrated=False, maps=True):
+        by, firsts, lasts = [], iter(first_paths), iter(last_paths)
+
+        def map_again(matched, **_):
+            if not maps:
+                raise ReconstructionError("too few photos")
+            by.append(matched.cameras[0].K[0, 0])
+            return of_lens(by[-1])
+
+        def path(f, sigma_px):
+            result = SimpleNamespace(reconstruction=of_lens(f), sigma_px=sigma_px)
+            return SimpleNamespace(clip=None, result=result, options=None, filmed=None)
+
+        monkeypatch.setattr(video_path, "map_photos", map_again)
+        monkeypatch.setattr(video_path, "_first_path", lambda *_: path(*next(firsts)))
+        monkeypatch.setattr(video_path, "_path_again", lambda *_: path(next(lasts), 0.1))
+        placed = of_lens(500.0), Matches(calibrated)
+        found = _travelled(None, None, None, StageLog(None), None, lambda: placed)
+        assert not [*firsts], "a path was not asked for"
+        assert not [*lasts], "an adjustment was not asked for"
+        return by, found.result.reconstruction.cameras[0].K[0, 0]
+
+    return clip_of
+
+
+def test_a_lens_that_mapping_had_right_costs_nothing(clip_of):
+    assert clip_of([(510.0, 0.2)], [511.0]) == ([], 511.0)
+
+
+def test_a_scene_is_mapped_again_by_the_lens_of_its_path_until_that_stays(clip_of):
+    assert clip_of([(400.0, 0.5), (360.0, 0.3), (355.0, 0.2)], [356.0]) == ([400.0, 360.0], 356.0)
+
+
+def test_a_scene_that_fits_no_better_is_not_taken(clip_of):
+    assert clip_of([(400.0, 0.5), (300.0, 0.5)], [401.0]) == ([400.0], 401.0)
+
+
+def test_photos_that_cannot_be_mapped_again_keep_their_scene(clip_of):
+    assert clip_of([(400.0, 0.5)], [401.0], maps=False) == ([], 401.0)
+
+
+def test_the_last_adjustment_is_repeated_while_it_moves_the_lens_but_not_forever(clip_of):
+    assert clip_of([(500.0, 0.2)], [470.0, 465.0])[1] == 465.0
+    assert clip_of([(500.0, 0.2)], [470.0, 440.0, 410.0])[1] == 410.0
+
+
+def test_the_lens_of_a_camera_that_is_given_is_believed(clip_of):
+    assert clip_of([(400.0, 0.5)], [350.0], calibrated=True) == ([], 350.0)
