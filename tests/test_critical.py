@@ -359,7 +359,6 @@ def test_a_known_height_and_width_fix_the_scale(rng):
 @pytest.mark.parametrize(
     ("end", "length", "sigma", "says"),
     [
-        (("00.jpg", 5000.0, 0.0), 1.0, 0.1, "no point was measured"),
         (("nobody", 0.0, 0.0), 1.0, 0.1, "'nobody' is not a photo"),
         (None, 1.0, 0.0, "sigma"),
         (None, -1.0, 0.1, "length"),
@@ -375,10 +374,29 @@ def test_bad_lengths_are_refused(end, length, sigma, says, rng):
 
     with pytest.raises(InputError, match=says):
         solve(end or seen_at(truth, 2), seen_at(truth, 3), length, sigma)
-    with pytest.raises(InputError, match="same point"):
-        solve(seen_at(truth, 2), seen_at(truth, 2), 1.0, 0.1)
     with pytest.raises(InputError, match="scale of the world"):
         BundleOptions(lengths=[good])
+
+
+@pytest.mark.parametrize("what", ["far from any point", "the same point", "a wrong match"])
+def test_lengths_without_two_points_are_left_out_and_named(what, rng):
+    truth = with_measurements(named_scene("random"), np.zeros((10, 3)), "rotation")
+    good = [KnownLength(seen_at(truth, k), seen_at(truth, k + 1), 1.0, 0.1) for k in range(2)]
+    start, end = seen_at(truth, 4), seen_at(truth, 5)
+    if what == "far from any point":
+        end, says = ("00.jpg", 5000.0, 0.0), r"no point is measured within 5 px of \(5000, 0\) in 00.jpg"
+    elif what == "the same point":
+        end, says = start, "the same point"
+    else:  # it was measured where the user pointed, and is an outlier
+        xy, says = truth.observations.xy_raw.copy(), "no point is measured"
+        xy[np.flatnonzero((xy == start[1:]).all(1))] += [300, 0]
+        start = (start[0], start[1] + 300, start[2])
+        truth = replace(truth, observations=replace(truth.observations, xy_raw=xy))
+    lengths = [*good, KnownLength(start, end, 1.0, 0.1)]
+    with pytest.warns(RsUndistortWarning, match=f"a known length is not used: .*{says}"):
+        found = bundle_adjust(truth, "rotation", BundleOptions(lengths=lengths, loss="huber")).reconstruction
+    without = bundle_adjust(truth, "rotation", BundleOptions(lengths=good, loss="huber")).reconstruction
+    np.testing.assert_allclose(found.center_w, without.center_w, atol=1e-4)
 
 
 def test_lengths_of_photos_that_are_not_registered_are_left_out_and_named(rng):

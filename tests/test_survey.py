@@ -23,6 +23,7 @@ from rsundistort.bundle.problem import BundleProblem
 from rsundistort.errors import InputError, RsUndistortWarning
 from rsundistort.io import ExifFacts, GpsFix, read_solution, write_solution
 from rsundistort.model import ControlPoint
+from rsundistort.model.projection import project_points
 from rsundistort.report.facts import map_facts, map_rows
 from rsundistort.solve.outcome import solution_of
 from rsundistort.solve.survey import survey_of
@@ -136,6 +137,28 @@ def test_control_points_alone_make_the_frame():
     held = np.array([each["residual_m"] for each in solved.georeference["control"].values()])
     assert np.sqrt((held**2).mean(0)) == pytest.approx(np.zeros(3), abs=0.2)
     assert np.linalg.norm(solved.shared.center_w - flight.center_w, axis=1).max() < 1.0
+
+
+@pytest.mark.parametrize("places", [[(-8, 0, 1), (0, 0, 1), (8, 0, 1)], [(-8, 0, 1), (8, 0, 1)]], ids=["line", "two"])
+def test_control_points_that_do_not_determine_the_frame_move_it(places):
+    flight = Flight(seed=3)
+    rec = flight.unmoved
+    facts = flight.facts()
+    # a datum that is off by 30 m
+    facts = [replace(each, fix=replace(each.fix, altitude_m=each.fix.altitude_m + 30.0)) for each in facts]
+    middle, control = np.median(flight.points_w, axis=0) * [1, 1, 0], []
+    for k, each in enumerate(places):
+        place = middle + each
+        xy, seen = project_points(np.einsum("mij,mj->mi", rec.R_cw, place - rec.center_w), rec.camera(0), None, "global")
+        seen &= ((xy >= 0) & (xy <= [767, 511])).all(1)
+        shown = {flight.names[i]: tuple(xy[i].tolist()) for i in np.flatnonzero(seen)}
+        utm = tuple(map(float, to_utm(place)))
+        control.append(ControlPoint(f"P{k}", utm, (0.02,) * 3, shown))
+    survey, by_gps = survey_of("EPSG:32632", control, flight.names, facts, [(768, 512)] * 10).placed(rec)
+    survey, placed = survey.controlled(by_gps, 0.3)
+    assert (placed.center_w[:10] - by_gps.center_w)[:, 2].mean() == pytest.approx(-30.0, abs=2.0)
+    assert survey.gps_offset_m[2] == pytest.approx(-30.0, abs=2.0)
+    assert any("control points only move the model" in each for each in survey.notes)
 
 
 def test_no_crs_keeps_a_frame_of_its_own():

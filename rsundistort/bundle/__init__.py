@@ -9,7 +9,7 @@ from .choice import choose_model
 from .control import CONTROL_SIGMA_PX, PlacedControl, place_control, with_control
 from .direction import ReadoutChoice, choose_readouts
 from .intrinsics import GuessedCameras, deviation, pixels_of
-from .known_lengths import scale_of_lengths
+from .known_lengths import measured_lengths, scale_of_lengths
 from .known_motions import FAR, KnownMotions, judge_known_motions, misses_of
 from .known_positions import KnownPlaces
 from .model_choice import ModelChoice
@@ -39,6 +39,7 @@ __all__ = [
     "objective",
     "pixels_of",
     "place_control",
+    "measured_lengths",
     "scale_of_lengths",
     "sequence_to",
     "with_control",

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, RsUndistortWarning
 from ..model import Reconstruction, check_shutter_model
 from .bundle_options import BundleOptions, BundleResult
+from .known_lengths import measured_lengths
 from .layout import Layout
 from .prior_sigmas import estimates_sigmas, starting_sigmas
 from .problem import BundleProblem
@@ -101,7 +103,11 @@ def bundle_adjust(
             break
         exact = exact or rounds.are_settled
         rounds.begin_next(with_same_weights=rounds.are_settled)
-    return rounds.result()
+    result = rounds.result()
+    if options.deviations == "jackknife":  # another adjustment may find their points
+        for reason in measured_lengths(result.reconstruction, options.lengths)[1]:
+            warnings.warn(f"a known length is not used: {reason}", RsUndistortWarning, stacklevel=2)
+    return result
 
 
 def sequence_to(shutter_model: str) -> tuple[str, ...]:

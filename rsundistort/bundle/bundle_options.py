@@ -129,7 +129,8 @@ class BundleOptions:
         constant-motion the whole motion: the velocity up to a translation that displaces the photo's content, at its
         median depth, as the angle does.
     lengths : sequence of KnownLength
-        Known lengths in the scene, two or more: their ratios are residuals.
+        Known lengths in the scene, two or more: their ratios are residuals. Those without a measured point at both ends,
+        any more, are left out, and named if the adjustment is not one of `deviations` by the model, which are rough.
     places : KnownPlaces, optional
         Positions of photos and control points, in the frame of the reconstruction. Three or more determine the gauge,
         in place of the fixed photo; fewer are ignored.

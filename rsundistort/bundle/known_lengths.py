@@ -8,10 +8,10 @@ import numpy as np
 
 from ..errors import InputError
 from ..model import KnownLength, Reconstruction
-from ..model.array_types import Array
+from ..model.array_types import Array, Index
 from ..model.known_length import End
 
-__all__ = ["LengthResiduals", "check_lengths", "scale_of_lengths"]
+__all__ = ["LengthResiduals", "check_lengths", "measured_lengths", "scale_of_lengths"]
 
 # Largest distance of a point's measurement from where the user pointed, pixels.
 _REACH_PX = 5.0
@@ -24,8 +24,27 @@ def check_lengths(lengths: Sequence[KnownLength]) -> tuple[KnownLength, ...]:
     return tuple(lengths)
 
 
-def _nearest_point(reconstruction: Reconstruction, end: End) -> int:
-    """The point that was measured nearest to a pixel of a photo."""
+def measured_lengths(
+    reconstruction: Reconstruction, lengths: Sequence[KnownLength]
+) -> tuple[tuple[KnownLength, ...], list[str]]:
+    """The lengths between two points that are measured, none if only one is left; and why the others are none.
+
+    Points change while outliers are dropped and tracks are made again.
+    """
+    kept, lost = [], []
+    for each in lengths:
+        ends = [_nearest_point(reconstruction, end) for end in (each.start, each.end)]
+        far = [end for end, point in zip((each.start, each.end), ends, strict=True) if point is None]
+        lost += [f"no point is measured within {_REACH_PX:.0f} px of ({x:g}, {y:g}) in {name}" for name, x, y in far]
+        if ends[0] == ends[1] and not far:
+            lost.append(f"{each.start} and {each.end} are the same point of the scene")
+        elif not far:
+            kept.append(each)
+    return tuple(kept if len(kept) > 1 else ()), lost
+
+
+def _nearest_point(reconstruction: Reconstruction, end: End) -> int | None:
+    """The point that is measured nearest to a pixel of a photo; None if there is none near it."""
     name, x, y = end
     if name not in reconstruction.image_names:
         raise InputError(f"known length: {name!r} is not a photo of the reconstruction")
@@ -33,32 +52,32 @@ def _nearest_point(reconstruction: Reconstruction, end: End) -> int:
     mine = np.flatnonzero(obs.frame_idx == reconstruction.image_names.index(name))
     distance = np.linalg.norm(obs.xy_raw[mine] - [x, y], axis=1)
     if not len(mine) or distance.min() > _REACH_PX:
-        raise InputError(f"known length: no point was measured within {_REACH_PX:.0f} px of ({x:g}, {y:g}) in {name}")
+        return None
     return int(obs.point_idx[mine[np.argmin(distance)]])
 
 
 def scale_of_lengths(reconstruction: Reconstruction, lengths: Sequence[KnownLength]) -> tuple[float, float]:
     """Lengths of a reconstruction over the known ones, their weighted geometric mean, and its relative deviation."""
-    ends = [(_nearest_point(reconstruction, each.start), _nearest_point(reconstruction, each.end)) for each in lengths]
-    points = reconstruction.points_w
-    found = np.log(
-        [np.linalg.norm(points[b] - points[a]) / each.length for (a, b), each in zip(ends, lengths, strict=True)]
-    )
+    chord = np.diff(reconstruction.points_w[_ends(reconstruction, lengths)], axis=1)[:, 0]
+    found = np.log(np.linalg.norm(chord, axis=1) / [each.length for each in lengths])
     weight = np.array([(each.length / each.sigma) ** 2 for each in lengths])
     return float(np.exp(np.average(found, weights=weight))), float(weight.sum() ** -0.5)
 
 
+def _ends(reconstruction: Reconstruction, lengths: Sequence[KnownLength]) -> Index:
+    """(q, 2) points that `measured_lengths` are between."""
+    found = [[_nearest_point(reconstruction, end) for end in (each.start, each.end)] for each in lengths]
+    return np.array(found, np.int64).reshape(-1, 2)
+
+
 class LengthResiduals:
-    """Residuals of known lengths, none or two and more: logarithms of their ratios, the common scale taken out."""
+    """Residuals of known lengths, none or two and more: logarithms of their ratios, the common scale taken out.
+
+    They are those that are measured (`measured_lengths`).
+    """
 
     def __init__(self, reconstruction: Reconstruction, lengths: Sequence[KnownLength]) -> None:
-        ends = [
-            (_nearest_point(reconstruction, each.start), _nearest_point(reconstruction, each.end)) for each in lengths
-        ]
-        for (a, b), each in zip(ends, lengths, strict=True):
-            if a == b:
-                raise InputError(f"known length: {each.start} and {each.end} are the same point of the scene")
-        self._ends = np.array(ends, np.int64).reshape(-1, 2)
+        self._ends = _ends(reconstruction, lengths)
         self._target = np.log([each.length for each in lengths])
         weight = np.array([each.length / each.sigma for each in lengths])
         unit = weight[:, None] / max(float(np.linalg.norm(weight)), 1e-300)

@@ -21,7 +21,7 @@ from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import by_corner, by_place
-from .known_lengths import LengthResiduals
+from .known_lengths import LengthResiduals, measured_lengths
 from .known_positions import KnownPlaces, PlaceResiduals
 from .layout import Layout
 from .lens_field import LensFields
@@ -138,7 +138,7 @@ class BundleProblem:
         span = reconstruction.frame_span()[:, None]
         self._motion_prior = MotionPrior.of(reconstruction, options, sigmas.phi, sigmas.velocity, self._block - 6)
         self._own_weight = self._weight_of_own(sigmas)
-        self._lengths = LengthResiduals(self._start, options.lengths)
+        self._lengths = LengthResiduals(self._start, measured_lengths(self._start, options.lengths)[0])
         self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()

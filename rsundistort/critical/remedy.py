@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..bundle import BundleOptions, BundleResult, Posterior, bundle_adjust
+from ..bundle import BundleOptions, BundleResult, Posterior, bundle_adjust, measured_lengths
 from ..bundle.common_motion import MotionMeans
 from ..errors import InputError
 from ..model.array_types import Array
@@ -212,7 +212,7 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
         return result, Remedy("path", {}, before, before)
     still = {name: 0.0 for name, held in options.held_phi.items() if held} | dict(options.still)
     given = still | {name: float(np.min(sigma)) for name, (_, sigma) in options.known_phi.items()}
-    if given or options.lengths:
+    if given or measured_lengths(result.reconstruction, options.lengths)[0]:
         said = contradictions(result, options, still)
         return result, Remedy("given", given, before, before, said + _warnings(before))
     if remedy == "none":

@@ -45,6 +45,7 @@ from .run_outputs import (
     files_of_run,
     inputs_of,
     photo_times,
+    remove_former,
 )
 from .survey import survey_of
 from .tracks import TrackSource
@@ -214,6 +215,7 @@ def _solve_files(job: _Job, overwrite: bool, resume: bool, progress: ProgressCal
                 written = _outputs_of(job, log, before)
                 solution = written.begin(scratch, log)
             before.begin()
+        remove_former(out, job.outputs)
         if job.images is not None:
             return written.rectify(job.images, out, job.workers, log, before.begun)
         written.report(out, job.workers.jobs, log)

@@ -38,6 +38,7 @@ from .run_options import RunOptions, SolveOptions
 from .run_outputs import (
     OF_VIDEOS,
     REPLACED,
+    USD,
     VIDEO,
     Outputs,
     check_images_of,
@@ -45,6 +46,7 @@ from .run_outputs import (
     files_of_run,
     inputs_of,
     photo_times,
+    remove_former,
 )
 from .survey import survey_of
 from .video_path import frame_path, solve_clip
@@ -105,7 +107,8 @@ def run(
         raise InputError(f"{photos} is no video; --frames all is for one")
     if is_clip:
         check_of_video(options)
-    of_video = [name for name in OF_VIDEOS if name != VIDEO or options.frames == "all"] if is_clip else []
+    unasked = {VIDEO: options.frames != "all", USD: not options.outputs.usd}
+    of_video = [name for name in OF_VIDEOS if not unasked.get(name)] if is_clip else []
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
     with run_folder(out, key_of(inputs, options), log, overwrite=overwrite, resume=resume) as before:
         if before.finished:
@@ -118,8 +121,7 @@ def run(
                 outputs = _solved(photos, out, scratch, options, inputs, of_video, workers, log, before)
                 outputs.begin(scratch, log)
             before.begin()
-        # what an earlier run left there belongs to another path
-        Record(out).remove([name for name in OF_VIDEOS if name not in of_video])
+        remove_former(out, options.outputs, of_video)
         if options.frames == "all":
             stages: list[dict[str, Any]] | None = before.kept.get(VIDEO)
             if stages is None:

@@ -6,7 +6,7 @@ import os
 import shlex
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -61,6 +61,7 @@ from .run_options import OutputOptions, SolveOptions
 __all__ = [
     "OF_VIDEOS",
     "REPLACED",
+    "USD",
     "VIDEO",
     "Outputs",
     "check_images_of",
@@ -68,6 +69,7 @@ __all__ = [
     "files_of_run",
     "inputs_of",
     "photo_times",
+    "remove_former",
 ]
 
 #: Folders that a run replaces.
@@ -85,6 +87,7 @@ _FILES = (
     "solution.json", "report.npz", "poses.txt", "points.ply", "transforms.json", "run-colmap-geometric.sh",
     "run-colmap-photometric.sh", "stereo/fusion.cfg", "stereo/patch-match.cfg",
 )  # fmt: skip
+_REPORT = "report.html"
 _RS_POSES = ("rs-poses/gsplat.npz", "rs-poses/transforms.json")
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
@@ -95,11 +98,27 @@ def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> l
     Refuses photos that an export would confuse.
     """
     check_exports(options.exports, names)
-    files = [*_FILES, *(f"sparse/{part}.{options.sparse_format}" for part in _PARTS)]
-    files += [*_RS_POSES] * options.rs_poses + ["report.html"] * options.report
-    files += [f"{name}/{file}" for name in options.exports for file in EXPORTS[name].files]
     masks = mask_names(names)
+    files = [*_FILES, *(f"sparse/{part}.{options.sparse_format}" for part in _PARTS), *_asked_for(options)]
     return files + [each for n in names for each in (f"images/{output_name(n, raw_as)}", f"masks/{masks[n]}")]
+
+
+def _asked_for(options: OutputOptions) -> list[str]:
+    """Files that are written where they are asked for, but those of videos."""
+    return [*_RS_POSES] * options.rs_poses + [_REPORT] * options.report + _exported(options.exports)
+
+
+def _exported(programs: Iterable[str]) -> list[str]:
+    return [f"{name}/{file}" for name in programs for file in EXPORTS[name].files]
+
+
+def remove_former(out: Path, options: OutputOptions, of_video: Sequence[str] = ()) -> None:
+    """Remove what an earlier run wrote that was not asked for this time: it belongs to another solution.
+
+    `of_video` are the files of a video that are written this time.
+    """
+    every = {*_RS_POSES, _REPORT, *_exported(EXPORTS), *OF_VIDEOS}
+    Record(out).remove(every - {*_asked_for(options), *of_video})
 
 
 def check_images_of(names: Sequence[str], options: RectifyOptions) -> None:
@@ -443,4 +462,4 @@ def _only_warned_of() -> Iterator[None]:
         yield
     except Exception as error:
         said = " ".join(str(error).split()) or type(error).__name__
-        warnings.warn(MissingOutputWarning(f"no report was written: {said}", "report.html"), stacklevel=4)
+        warnings.warn(MissingOutputWarning(f"no report was written: {said}", _REPORT), stacklevel=4)

@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..bundle import CONTROL_SIGMA_PX, KnownPlaces, place_control, scale_of_lengths, with_control
+from ..bundle import (
+    CONTROL_SIGMA_PX,
+    KnownPlaces,
+    measured_lengths,
+    place_control,
+    scale_of_lengths,
+    with_control,
+)
 from ..bundle.known_positions import point_of, stacked
 from ..errors import InputError, RsUndistortWarning
 from ..input.positions import MapFrame, PhotoPositions, frame_at, frame_of_control, positions_of
@@ -144,15 +151,15 @@ class Survey:
         notes = [*self.notes]
         if lost:
             notes.append(f"control points that fewer than two registered photos see: {', '.join(lost)}")
-        survey = replace(self, notes=notes)
         targets, sigma = stacked([(each.place_m, each.sigma_m) for each in found.points])
-        problem = f"{len(found.points)} control points are seen by registered photos, three are needed"
+        survey, problem = self, f"{len(found.points)} control points are seen by registered photos, three are needed"
         if len(found.points) >= _LEAST:
             fit = self._fitted(rec, found.points_w, targets, sigma)
             problem = _misfit(fit, "control points", robust=False)
             if not problem:
-                rec, survey = fit.similarity.of_reconstruction(rec), replace(survey, fit=fit)
-        elif self.fit is not None and found.points:
+                rec, survey = fit.similarity.of_reconstruction(rec), replace(self, fit=fit)
+        if problem and self.fit is not None and found.points:
+            notes.append(f"control points only move the model: {problem}")
             rec = Similarity(1.0, np.eye(3), (targets - found.points_w).mean(0)).of_reconstruction(rec)
         if problem and self.fit is None:
             said = f"not on the map: {problem}; poses are in a frame of their own"
@@ -164,7 +171,7 @@ class Survey:
             offset = np.median(centers - places, axis=0)
             moved = {name: (place + offset, sigma) for name, (place, sigma) in self.places.items()}
             survey = replace(survey, places=moved, gps_offset_m=self.gps_offset_m + offset)
-        return survey, with_control(rec, survey.holding, CONTROL_SIGMA_PX / sigma_px)
+        return replace(survey, notes=notes), with_control(rec, survey.holding, CONTROL_SIGMA_PX / sigma_px)
 
     def settled(self, rec: Reconstruction) -> tuple[Survey, Reconstruction]:
         """The adjusted reconstruction aligned with its places: the last steps of an adjustment need not move it."""
@@ -258,12 +265,10 @@ class Survey:
     def _lengths(self, rec: Reconstruction, lengths: Sequence[KnownLength]) -> dict[str, Any]:
         """Ratio of known lengths in metres of the map to the given values, with a warning if they contradict it."""
         assert self.fit is not None
+        lengths, _ = measured_lengths(rec, lengths)
         if not lengths:
             return {}
-        try:
-            ratio, sigma = scale_of_lengths(rec, lengths)
-        except InputError:  # their points were dropped as outliers
-            return {}
+        ratio, sigma = scale_of_lengths(rec, lengths)
         sigma = float(np.hypot(sigma, self.fit.sigma_scale))
         if abs(np.log(ratio)) > _CONTRADICTS * sigma:
             warnings.warn(
