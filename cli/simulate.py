@@ -103,7 +103,7 @@ def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
         from rsundistort.synthetic import Vibration
 
         if "gyro" not in given:
-            opt.check_needed(given, "--gyro", {"gyro_axes": "--gyro-axes"})
+            opt.check_needed(given, "--gyro", {"gyro_axes": "--gyro-axes", "readout_ms": "--readout-ms"})
         if not given.get("vibration"):
             opt.check_needed(given, "--vibration", {"periods": "--vibration-periods", "axis": "--vibration-axis"})
         if "motion" in given and "sigma_rad" in given:

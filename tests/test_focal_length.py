@@ -102,11 +102,19 @@ def test_the_focal_length_of_photos_without_one_is_found_and_said(photos):
     assert not found.calibrated
 
 
-@pytest.mark.parametrize(("sigmas", "said"), [({"f": 4.0}, False), ({"f": 40.0}, True), ({}, True)])
-def test_a_focal_length_is_called_weak_if_the_solution_leaves_it_so(recwarn, sigmas, said):
+@pytest.mark.parametrize(
+    ("sigmas", "used", "said"),
+    [
+        ({"f": 4.0}, {0}, False), ({"f": 40.0}, {0}, True), ({}, {0}, True),
+        ({"fx": 4.0, "fy": 4.0}, {0}, False), ({"fx": 40.0, "fy": 4.0}, {0}, True),
+        # no photo of the camera is registered
+        ({"f": 40.0}, {1}, False),
+    ],
+)  # fmt: skip
+def test_a_focal_length_is_called_weak_if_the_solution_leaves_it_so(recwarn, sigmas, used, said):
     guess = Camera(320, 240, [[272.0, 0, 159.5], [0, 272.0, 119.5], [0, 0, 1]])
     cameras = PhotoCameras([guess], ["a"], np.zeros(3, int), False, (False,), "", sigma=[{"f": 0.3}], without_focal=[0])
-    warn_of_weak_focal_lengths(cameras, [guess], [sigmas])
+    warn_of_weak_focal_lengths(cameras, [guess], [sigmas], used)
     assert [str(each.message).startswith("the photos hardly determine") for each in recwarn] == [True] * said
     warn_of_weak_focal_lengths(replace(cameras, without_focal=[]), [guess], [{"f": 100.0}])
     assert len(recwarn) == said

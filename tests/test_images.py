@@ -169,6 +169,10 @@ def test_list_photos_sorts_and_passes_over_other_files(tmp_path):
     assert list_photos(tmp_path) == ["a.png", "b.JPG", "c.tiff", "d.NEF", "e.webp"]
     (tmp_path / "f.jpg").symlink_to("nowhere.jpg")  # reading it says that it leads nowhere
     assert list_photos(tmp_path)[-1] == "f.jpg"
+    for name in ("f10.jpg", "f9.jpg", "f09.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    # names without leading zeros are in the order of capture, too
+    assert list_photos(tmp_path)[5:8] == ["f09.jpg", "f9.jpg", "f10.jpg"]
 
 
 @pytest.mark.parametrize("kind", ["empty", "missing", "file", "others"])

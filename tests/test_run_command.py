@@ -197,6 +197,7 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_camera_sigma("k1=nan"), "sigma of k1 is nan"),
         (_camera_sigma("k4=1"), "camera_sigma: k4 of a pinhole lens"),
         (_camera_sigma("f=1", "--refine", "none"), "refine none fixes the camera"),
+        (_camera_sigma("fx=1", "--refine", "f,k1"), "how far fx may be off, which refine keeps fixed"),
         (_still_of_global, "a global shutter has no motion"),
     ],
 )

@@ -149,7 +149,8 @@ def test_control_points_that_do_not_determine_the_frame_move_it(places):
     middle, control = np.median(flight.points_w, axis=0) * [1, 1, 0], []
     for k, each in enumerate(places):
         place = middle + each
-        xy, seen = project_points(np.einsum("mij,mj->mi", rec.R_cw, place - rec.center_w), rec.camera(0), None, "global")
+        in_cameras = np.einsum("mij,mj->mi", rec.R_cw, place - rec.center_w)
+        xy, seen = project_points(in_cameras, rec.camera(0), None, "global")
         seen &= ((xy >= 0) & (xy <= [767, 511])).all(1)
         shown = {flight.names[i]: tuple(xy[i].tolist()) for i in np.flatnonzero(seen)}
         utm = tuple(map(float, to_utm(place)))

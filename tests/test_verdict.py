@@ -160,11 +160,19 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
         rec, R_cw=pan @ rec.R_cw[0], phi=np.tile(ROLL, (8, 1)) / CAMERA.frame_span, shutter_model="rotation"
     )
     assert _repeated(order) is None
-    assert _repeated(replace(order, R_cw=order.R_cw[::-1])) == 2
+    axis, rotation = _repeated(replace(order, R_cw=order.R_cw[::-1]))
+    assert (axis, rotation) == (2, pytest.approx(ROLL[2]))
     # photos that came out wrong do not hide it
     phi = np.array(order.phi)
     phi[2] *= -40.0
-    assert _repeated(replace(order, R_cw=order.R_cw[::-1], phi=phi)) == 2
+    assert _repeated(replace(order, R_cw=order.R_cw[::-1], phi=phi))[0] == 2
+    # nor does another camera, that did not move at all
+    phi = np.array(order.phi)
+    phi[5:] = 0.0
+    of_two = np.array([0] * 5 + [1] * 3)
+    assert _repeated(replace(order, R_cw=order.R_cw[::-1], phi=phi)) is None
+    of_two = replace(order, cameras=[CAMERA] * 2, camera_idx=of_two, R_cw=order.R_cw[::-1], phi=phi)
+    assert _repeated(of_two)[0] == 2
     # a gyroscope may say so, too
     result = bundle_adjust(rec, "rotation")
     assert judge(result, None, choice_of("rotation", gain=9.0)).lens_only == tuple(rec.image_names)

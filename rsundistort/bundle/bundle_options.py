@@ -129,8 +129,8 @@ class BundleOptions:
         constant-motion the whole motion: the velocity up to a translation that displaces the photo's content, at its
         median depth, as the angle does.
     lengths : sequence of KnownLength
-        Known lengths in the scene, two or more: their ratios are residuals. Those without a measured point at both ends,
-        any more, are left out, and named if the adjustment is not one of `deviations` by the model, which are rough.
+        Known lengths in the scene, two or more: their ratios are residuals. Those without two points, or whose points
+        are lost as outliers, are left out; adjustments of `deviations` by a jackknife name them, others are rough.
     places : KnownPlaces, optional
         Positions of photos and control points, in the frame of the reconstruction. Three or more determine the gauge,
         in place of the fixed photo; fewer are ignored.
@@ -155,9 +155,9 @@ class BundleOptions:
         How far another model that may be right moves rotation, centre, phi and velocity of a photo, times the root of
         its probability: its square is added to the covariances (`bundle.doubt`). The estimate does not depend on it.
     path : FramePath, optional
-        Frames of a video share one trajectory: a prior of white noise on acceleration connects neighbours, phi and
-        velocity are the trajectory's rates times the readout time, which is estimated. For constant-motion only;
-        replaces the priors on phi and velocity.
+        Frames of a video share one trajectory: a prior of white noise on the change of acceleration connects
+        neighbours, phi and velocity are the trajectory's rates times the readout time, which is estimated. For
+        constant-motion only; replaces the priors on phi and velocity.
     """
 
     max_iterations: int = 100

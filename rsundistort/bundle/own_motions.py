@@ -21,7 +21,7 @@ _UNKNOWNS = 9
 _LOOSE = 1.0
 # Rounds of frames by points and points by frames, and steps of the frames in each.
 _ROUNDS, _STEPS = 3, 6
-_NOISE_PX, _LEAST_NOISE_PX = 1.0, 0.02
+_LEAST_NOISE_PX = 0.02
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
         loss="cauchy", known_bends={name: bend for name, bend in bends.items() if bend is not None},
         varying=reconstruction.varies,
     )  # fmt: skip
-    problem = BundleProblem(reconstruction, "constant-motion", options, _NOISE_PX, PriorSigmas(_LOOSE, _LOOSE))
+    problem = BundleProblem(reconstruction, "constant-motion", options, 1.0, PriorSigmas(_LOOSE, _LOOSE))
     own = np.array([0, 1, 2, 6, 7, 8] if rotation_only else range(_UNKNOWNS))
     state = problem.initial_state()
     for last in range(1 if rotation_only else _ROUNDS):
@@ -78,7 +78,7 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
     # heavy tails count as those of normal noise do, and each frame has its own unknowns
     size, m = np.median(np.abs(residuals)) / 0.6745, reconstruction.num_images
     share = max(1.0 - len(own) * m / residuals.size, 0.1)
-    noise = max(size * _NOISE_PX / np.sqrt(share), _LEAST_NOISE_PX) / _NOISE_PX
+    noise = max(size / np.sqrt(share), _LEAST_NOISE_PX)
     believed = np.linalg.norm(residuals, axis=1) < 4.5 * noise
     J *= believed[:, None, None]
     H = _gradients(problem.by_photo, residuals, J, own)[0]

@@ -96,8 +96,8 @@ class PriorSigmas:
     means: MeansPrior | None = None
 
 
-def _prior_sigma(values: Array, variance: Array, span: Array, sigma: float) -> float:
-    """Prior standard deviation, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
+def _prior_sigma(values: Array, variance: Array, sigma: float) -> float:
+    """Prior standard deviation of unknowns (m, k) with posterior variances (m, k).
 
     It is estimated over photos and axes; `sigma` is that under which they were found. Values beyond three robust
     standard deviations count as three: a few photos that moved far more, or that few measurements connect, must not
@@ -106,9 +106,8 @@ def _prior_sigma(values: Array, variance: Array, span: Array, sigma: float) -> f
     free = variance > 0
     if not free.any():
         return 0.0
-    scale = np.broadcast_to(span[:, None] ** 2, values.shape)[free]
-    square, unknown = values[free] ** 2 * scale, float((variance[free] * scale).mean())
-    robust = float(np.median(square + variance[free] * scale)) / 0.455  # median of the square of a normal variable
+    square, unknown = values[free] ** 2, float(variance[free].mean())
+    robust = float(np.median(square + variance[free])) / 0.455  # median of the square of a normal variable
     seen = float(np.minimum(square, 9.0 * robust).mean())
     return _fixed_point(seen, unknown, sigma)
 
@@ -159,7 +158,6 @@ def estimated(
     own, own_variances = _own_motions(current, covariances[:, 6 : layout.motion, 6 : layout.motion], common)
     limited = [options.phi_limits.get(name, np.inf) < sigmas.phi for name in current.image_names]
     own_variances = np.where(np.array(limited)[:, None], 0.0, own_variances)
-    ones = np.ones(len(own))
     found = sigmas
     if options.phi_sigma is None and own.shape[1] > 0:
         found = replace(found, phi=_scale(own[:, :3], own_variances[:, :3], sigmas.phi) + _MIN_SIGMA)
@@ -173,10 +171,10 @@ def estimated(
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
-        focal = _prior_sigma(varied[:, :1], of_varied[:, :1], ones, sigmas.focal)
+        focal = _prior_sigma(varied[:, :1], of_varied[:, :1], sigmas.focal)
         found = replace(found, focal=focal + _MIN_SIGMA)
         if layout.num_varying > 1:
-            centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre)
+            centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], sigmas.centre)
             found = replace(found, centre=centre + _MIN_SIGMA)
     bends, ways = _bend_sigmas(sigmas, current, variances[:, layout.variation :], layout)
     return _bounded(replace(found, bends=bends, ways=ways), options, baseline)
@@ -241,12 +239,12 @@ def _bend_sigmas(
     sigmas: PriorSigmas, current: Reconstruction, variances: Array, layout: Layout
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Prior standard deviations of the groups of bends, of rotations and of positions."""
-    ones, found = np.ones(current.num_images), layout.coefficients(current)
+    found = layout.coefficients(current)
     rotations = 3 * len(layout.group)
 
     def of(group: int, part: slice, sigma: float, least: float) -> float:
         mine = np.flatnonzero(np.repeat(np.array(layout.group[: (part.stop - part.start) // 3]) == group, 3))
-        return _prior_sigma(found[:, part][:, mine], variances[:, part][:, mine], ones, sigma) + least
+        return _prior_sigma(found[:, part][:, mine], variances[:, part][:, mine], sigma) + least
 
     own, ways = slice(0, rotations), slice(rotations, rotations + 3 * layout.ways)
     return (
@@ -324,7 +322,7 @@ def _bounded(sigmas: PriorSigmas, options: BundleOptions, baseline: float) -> Pr
 
 def field_prior_sigma(values: Array, variances: Array, sigma: float) -> float:
     """Prior standard deviation in pixels of the unknowns (k, n) of residual fields, as `_prior_sigma`."""
-    found = _prior_sigma(values, variances, np.ones(len(values)), sigma)
+    found = _prior_sigma(values, variances, sigma)
     return min(found + _MIN_SIGMA_PX, _MOST_PX)
 
 
@@ -334,9 +332,9 @@ def path_prior_sigmas(prior: PathPrior, residuals: Array, variances: Array, base
     With few frames, which hardly determine them, they are drawn to those of a hand.
     """
     squares, unknown = (prior.unit_squares(each) for each in (residuals**2, variances))
-    ones, found = np.ones(len(residuals)), []
+    found = []
     usual = _ROTATION_START, _TRAVEL_START * baseline
     for square, variance, sigma, start in zip(squares, unknown, prior.sigmas, usual, strict=True):
-        seen = _prior_sigma(np.sqrt(square), variance, ones, sigma) ** 2
+        seen = _prior_sigma(np.sqrt(square), variance, sigma) ** 2
         found.append(float(np.sqrt((square.size * seen + _USUAL_WEIGHT * start**2) / (square.size + _USUAL_WEIGHT))))
     return tuple(found)

@@ -11,8 +11,8 @@ from .load import LoadedPhotos
 
 __all__ = ["bounded_by_exposure"]
 
-# Readout time of cameras that the table lacks: the slowest in use.
-_LONGEST_READOUT_S = 0.05
+# Readout time of cameras that the table lacks: full frames without a mechanical shutter take up to a tenth of a second.
+_LONGEST_READOUT_S = 0.1
 
 
 def bounded_by_exposure(

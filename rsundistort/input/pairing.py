@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..io import ExifFacts
+from ..io.photos.images import natural_order
 from ..model.array_types import Array, Index
 from ..sfm import choose_pairs, global_descriptors
 from .load import LoadedPhotos
@@ -63,15 +63,9 @@ def capture_sequences(names: Sequence[str], camera_idx: Index, facts: Sequence[E
     for camera in range(int(camera_idx.max()) + 1):
         mine = np.flatnonzero(camera_idx == camera).tolist()
         timed = all(facts[k].taken_s is not None for k in mine)
-        order = sorted(mine, key=lambda k: ((facts[k].taken_s or 0.0) if timed else 0.0, _natural(names[k])))
+        order = sorted(mine, key=lambda k: ((facts[k].taken_s or 0.0) if timed else 0.0, natural_order(names[k])))
         sequences.append(np.array(order, np.int64))
     return sequences
-
-
-def _natural(name: str) -> tuple[tuple[int, str], ...]:
-    """Key that sorts 9.jpg before 10.jpg."""
-    parts = re.split(r"([0-9]+)", name)
-    return (*((int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)), (-1, name))
 
 
 def places_of(facts: Sequence[ExifFacts]) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -60,7 +60,7 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
 
 
 def warn_of_weak_focal_lengths(
-    cameras: PhotoCameras, solved: Sequence[Camera], sigmas: Sequence[Mapping[str, float]]
+    cameras: PhotoCameras, solved: Sequence[Camera], sigmas: Sequence[Mapping[str, float]], used: Collection[int]
 ) -> None:
     """Warn of cameras without a focal length whose photos, all together, hardly determine it.
 
@@ -71,11 +71,13 @@ def warn_of_weak_focal_lengths(
     solved, sigmas
         The same cameras, in this order, as solved; and standard deviations of their intrinsics in pixels, empty where
         these were not refined.
+    used : collection of int
+        Those of registered photos.
     """
     for k in cameras.without_focal:
-        focal = float(solved[k].K[0, 0])
-        sigma = sigmas[k].get("f", focal * cameras.sigma[k].get("f", 0.0)) if k < len(sigmas) else 0.0
-        if sigma > _WEAK * focal:
+        focal, refined = float(solved[k].K[0, 0]), sigmas[k] if k < len(sigmas) else {}
+        sigma = next((refined[name] for name in ("f", "fx") if name in refined), focal * cameras.sigma[k].get("f", 0.0))
+        if k in used and k < len(sigmas) and sigma > _WEAK * focal:
             said = f"{focal:.0f} +- {sigma:.0f} px; give --camera if you know it"
             warnings.warn(f"the photos hardly determine their focal length: {said}", RsUndistortWarning, stacklevel=3)
 

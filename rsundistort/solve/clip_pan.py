@@ -35,8 +35,7 @@ _TRIALS = 20
 _SAMPLES, _FEW, _FAST, _AT_FIRST, _FITS = 100, 6, 0.1, 6.0, 10
 # A focal length that nobody knows is off by such a factor at most; how many are tried, and key frames asked.
 _MOST_OFF, _GRID, _ASKED = 2.0, 9, 6
-# Key frames before a cut that one after it may show again, its features that may, and how much nearer than the next one
-# a match is.
+# Key frames before a cut that one after it may show again, and its features that may.
 _LAST, _MATCHED = 4, 2048
 
 

@@ -25,7 +25,7 @@ from ..io.models import read_model
 from ..io.outputs import work_folder
 from ..io.photos.images import stored_size
 from ..io.places import local_place
-from ..io.record import Record
+from ..io.record import Record, is_inside
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, orient_reconstruction
 from ..sfm import matched_of_database
@@ -47,7 +47,7 @@ from .run_outputs import (
     photo_times,
     remove_former,
 )
-from .survey import survey_of
+from .survey import clocks_of, survey_of
 from .tracks import TrackSource
 
 if TYPE_CHECKING:
@@ -202,8 +202,7 @@ def _solve_files(job: _Job, overwrite: bool, resume: bool, progress: ProgressCal
     if job.database is not None and model.is_file():
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
-    # a model is in the files of its folder, or beside it
-    key = key_of([*job.inputs, model / "sparse", model.parent / "tracks.csv"], job.options, job.rectify, job.outputs)
+    key = key_of([*job.inputs, *_parts_of(job)], job.options, job.rectify, job.outputs)
     with run_folder(out, key, log, overwrite=overwrite, resume=resume) as before:
         if before.finished:
             return read_solution(out / "solution.json")
@@ -220,6 +219,17 @@ def _solve_files(job: _Job, overwrite: bool, resume: bool, progress: ProgressCal
             return written.rectify(job.images, out, job.workers, log, before.begun)
         written.report(out, job.workers.jobs, log)
         return read_solution(out / "solution.json") if before.begun else solution
+
+
+def _parts_of(job: _Job) -> list[Path]:
+    """Files and folders in and beside a job's inputs that are read, too."""
+    model = job.model
+    found = [model / "sparse", model.parent / "tracks.csv"]
+    if model.suffix.lower() == ".opf":  # it names the files of the project
+        found.append(model.parent)
+    if job.images is not None:  # names may be "left/a.jpg"
+        found += sorted(each for each in job.images.rglob("*") if each.is_dir() and not is_inside(each, job.out))
+    return found
 
 
 def _outputs_of(job: _Job, log: StageLog, before: RunFolder) -> Outputs:
@@ -411,10 +421,14 @@ def _solve(
     for name in (*options.still, *options.known):
         if name not in rec.image_names:
             raise InputError(f"constraint on {name!r}, which is not among the photos of the model")
+    for name in (end[0] for each in options.lengths for end in (each.start, each.end)):
+        if name not in rec.image_names and name not in given.unregistered:
+            raise InputError(f"known length in {name!r}, which is not among the photos of the model")
 
-    survey = None
+    readouts, survey = known_readouts(exif, rec.cameras, rec.camera_idx, options.readout_s, None), None
     if options.crs is not None or options.control:  # else its frame is the model's
-        survey = survey_of(options.crs, options.control, rec.image_names, exif, sizes)
+        clock_s = clocks_of(rec.image_names, rec.camera_idx, readouts, cameras)
+        survey = survey_of(options.crs, options.control, rec.image_names, exif, sizes, clock_s)
 
     fitting = replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
     with work_folder() as work:
@@ -438,7 +452,6 @@ def _solve(
         warnings.warn(text, RsUndistortWarning, stacklevel=4)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
-    readouts = known_readouts((), after.cameras, after.camera_idx, options.readout_s, None)
     old = surviving_points(given.reconstruction, after)
     ids = given.ids_of(old, after.image_names)
     known = (old >= 0) & given.has_colors

@@ -28,7 +28,7 @@ from ..bundle import (
 )
 from ..bundle.doubt import steps_after
 from ..critical import Advice, Remedy, advise, heal, with_remedy
-from ..errors import ReconstructionError, RsUndistortWarning
+from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
@@ -229,7 +229,7 @@ def _by_affine_features(
     if track_source.of_affine is None or total - num_placed < least:
         return None
     # what is said of a solution that is not taken concerns nobody
-    with suppress(ReconstructionError), warnings.catch_warnings(record=True) as said:
+    with suppress(ReconstructionError, InputError), warnings.catch_warnings(record=True) as said:
         mapped, source = track_source.of_affine(strong)
         solved = solve(mapped, track_source=source)
     if solved is None or num_of_one_scale(solved.shared) <= num_placed:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult
-from ..errors import ReconstructionError, RsUndistortWarning
+from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..model.array_types import Mask
 from ..sfm import (
@@ -171,7 +171,7 @@ class Registrar:
         other = Registrar(source, self.wanted, self.log)
         try:
             found, found_left_out = other.all_registered(result, again=False)
-        except ReconstructionError:
+        except (ReconstructionError, InputError):
             return self, result, left_out
         more, fewer = other._new_tracks(found.reconstruction), self._new_tracks(result.reconstruction)
         if more.num_images < fewer.num_images or num_explained(more) <= num_explained(fewer):
@@ -271,7 +271,7 @@ class Registrar:
                 start = replace(start, cameras=right.cameras)
             self.log.begin(stage)
             mapped = None
-            with suppress(ReconstructionError):
+            with suppress(ReconstructionError, InputError):
                 mapped = map_without_motions(start, result.phi_rms, known_phi)
             self.log.end(stage, photos=0 if mapped is None else mapped.num_images)
             if mapped is None or mapped.num_images < LEAST_PHOTOS:

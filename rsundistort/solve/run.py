@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,8 @@ from .run_outputs import (
     photo_times,
     remove_former,
 )
-from .survey import survey_of
+from .survey import clocks_of, survey_of
+from .tracks import of_registered
 from .video_path import frame_path, solve_clip
 
 __all__ = ["check_of_video", "run", "solve_frames"]
@@ -70,7 +72,7 @@ def run(
     Parameters
     ----------
     photos : path
-        Folder of photos of one camera, or a video: its frames share one path, and its key frames, which go to
+        Folder of photos, or a video: its frames share one path, and its key frames, which go to
         `out/frames`, are the photos.
     out : path
         Folder for the outputs. It stays as it was until the motions are solved; then it gets the solution, and the
@@ -107,6 +109,8 @@ def run(
         raise InputError(f"{photos} is no video; --frames all is for one")
     if is_clip:
         check_of_video(options)
+    elif options.gyro is not None and options.solve.shutter_model == "global":
+        raise InputError("--gyro says how photos moved, and --model global has no motion; leave one of them out")
     unasked = {VIDEO: options.frames != "all", USD: not options.outputs.usd}
     of_video = [name for name in OF_VIDEOS if not unasked.get(name)] if is_clip else []
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
@@ -175,7 +179,8 @@ def _solved(
         solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log, kept)
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
-    warn_of_weak_focal_lengths(loaded.cameras, solved.result.reconstruction.cameras, solved.result.sigma_intrinsics)
+    rec, sigmas = solved.result.reconstruction, solved.result.sigma_intrinsics
+    warn_of_weak_focal_lengths(loaded.cameras, rec.cameras, sigmas, {*rec.camera_idx.tolist()})
     facts: dict[str, Any] = {} if is_clip else {"features": options.features}
     facts |= {
         "max_features": options.most_features(is_clip),
@@ -222,8 +227,7 @@ def _solve(
         return bounded_by_exposure(solving.options_for(cameras), rec, loaded, known_s)
 
     sizes = [(cameras.of(i).width, cameras.of(i).height) for i in range(len(loaded.names))]
-    known = {k: seconds for k, seconds in known_s.items() if cameras.readout_specified[k]}
-    clock_s = {name: known[k] for name, k in zip(loaded.names, cameras.camera_idx.tolist(), strict=True) if k in known}
+    clock_s = clocks_of(loaded.names, cameras.camera_idx, readouts, cameras)
     other = OtherFeatures(loaded, options.most_features(False), workers, log, options.feature_megapixels, kept)
     survey = survey_of(solving.crs, solving.control, loaded.names, loaded.facts, sizes, clock_s)
     with work_folder() as work:
@@ -282,12 +286,14 @@ def solve_frames(
     readouts = {} if at_once else known_readouts(
         bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log
     )  # fmt: skip
+    wanted = solving.options_for(cameras)
     with work_folder() as work:
         solved = solve_clip(
-            clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), work, log,
+            clip, keys, frame_path(clip, readouts.get(0)), partial(of_registered, wanted, says=False), work, log,
             seed=solving.seed, matching=options.matching, gyroscope=gyro_log, gyro_offset_s=around_s, kept=kept,
             at_once=at_once,
         )  # fmt: skip
+    of_registered(wanted, solved.shared)  # which names what was left out
     cameras.check_plausible(solved.shared.cameras)
     lost = keys.unregistered(solved.shared.image_names)
     return replace(solved, unregistered=lost, camera_of=keys.camera_of, readouts=readouts)

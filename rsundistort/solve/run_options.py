@@ -113,6 +113,10 @@ class SolveOptions(_Part):
         check_whole(self.seed, "seed", 0)
         if self.refine == () and self.camera_sigma:
             raise InputError("refine none fixes the camera, camera_sigma says how far it may be off; give one of them")
+        # fx and fy may be as far off as f is
+        refined = {*(self.refine or self.camera_sigma), *(["f"] if {"fx", "fy"} & {*(self.refine or ())} else [])}
+        if held := [name for name in self.camera_sigma if name not in refined]:
+            raise InputError(f"camera_sigma says how far {held[0]} may be off, which refine keeps fixed; add it there")
         if self.shutter_model == "global" and (self.still or self.known or self.known_bends):
             raise InputError("a global shutter has no motion; leave out still and known, or give another shutter model")
         check_crs(self.crs)

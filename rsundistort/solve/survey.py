@@ -20,14 +20,15 @@ from ..bundle import (
 )
 from ..bundle.known_positions import point_of, stacked
 from ..errors import InputError, RsUndistortWarning
+from ..input.gyroscope import Readouts
+from ..input.photo_cameras import PhotoCameras
 from ..input.positions import MapFrame, PhotoPositions, frame_at, frame_of_control, positions_of
 from ..io import ExifFacts
 from ..model import ControlPoint, KnownLength, Reconstruction
-from ..model.array_types import Array
+from ..model.array_types import Array, Index
 from ..model.similarity import FittedSimilarity, Similarity, fit_similarity
 
-__all__ = ["Survey", "survey_of"]
-
+__all__ = ["Survey", "clocks_of", "survey_of"]
 
 _LEAST = 3
 # Places georeference a model if they determine its rotation and scale to this: radians, relative.
@@ -354,6 +355,12 @@ def survey_of(
     places = dict(zip(positions.names, zip(placed, positions.sigma_m, strict=True), strict=True))
     notes = [*positions.notes, *([frame.note] * bool(frame.note))]
     return Survey(frame, frame.rotated(positions), places, in_frame, clock_s=clock_s or {}, notes=notes)
+
+
+def clocks_of(names: Sequence[str], camera_idx: Index, readouts: Readouts, cameras: PhotoCameras) -> dict[str, float]:
+    """Readout times of photos whose direction was specified, by which GPS gives velocities."""
+    known = {k: seconds for k, (seconds, _) in readouts.items() if cameras.readout_specified[k]}
+    return {name: known[k] for name, k in zip(names, camera_idx.tolist(), strict=True) if k in known}
 
 
 def _check_seen(control: Sequence[ControlPoint], sizes: Mapping[str, tuple[int, int]]) -> None:

@@ -327,12 +327,13 @@ def _of_motions(
             f"The {rec.shutter_model} model, which you named, explains no more than it leaves unexplained: its "
             "motions may be an error of the lens."
         )
-    if (axis := _repeated(rec, options)) is not None and not {*known}.issuperset(rec.image_names):
-        rotation = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
+    if (alike := _repeated(rec, options)) is not None and not {*known}.issuperset(rec.image_names):
+        axis, rotation = alike
         travel = "" if rec.shutter_model == "constant-motion" else ", or a camera that travels over flat ground"
         reasons.append(
-            f"All photos appear to have rotated alike, by {abs(rotation):.2f} degrees about {'xyz'[axis]}, as no hand "
-            f"does: an error of the lens looks like that{travel}{' (--model constant-motion)' if travel else ''}."
+            f"All photos{' of a camera' if len(rec.cameras) > 1 else ''} appear to have rotated alike, by "
+            f"{np.degrees(abs(rotation)):.2f} degrees about {'xyz'[axis]}, as no hand does: an error of the lens looks "
+            f"like that{travel}{' (--model constant-motion)' if travel else ''}."
         )
     by_known = None if choice is None else choice.known_motions
     if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
@@ -363,33 +364,41 @@ def _explains(result: BundleResult, global_result: BundleResult) -> bool:
     return improves(before, after, standard_errors(before - after, corners(rec, rec.observations)))
 
 
-def _repeated(rec: Reconstruction, options: BundleOptions | None = None) -> int | None:
-    """The axis of the camera about which all photos rotated alike and visibly; None if there is none.
+def _repeated(rec: Reconstruction, options: BundleOptions | None = None) -> tuple[int, float] | None:
+    """The axis of a camera about which all its photos rotated alike and visibly, and by how much; None if none did.
 
     None also if the camera rotated so from photo to photo, too: then it panned; or if they rotated by more than a lens
     could feign, of a camera that is what it was expected to be: a focal length that is wrong by a fifth makes up for as
     much in common.
     """
-    m = rec.num_images
     guessed = None if options is None else options.guessed
     most = np.inf if guessed is not None and guessed.surprises(rec.cameras) else _NO_LENS
+    found = (_repeated_of(k, rec, most) for k in range(len(rec.cameras)))
+    return next((each for each in found if each is not None), None)
+
+
+def _repeated_of(camera: int, rec: Reconstruction, most: float) -> tuple[int, float] | None:
+    """The same of one camera, below a rotation per unit of the clock."""
+    mine = np.flatnonzero(rec.camera_idx == camera)
+    m = len(mine)
     if m < _LEAST_PHOTOS:
         return None
-    phi = rec.phi * rec.frame_span()[:, None]
-    half_px = float(np.median([rec.camera(i).K[0, 0] for i in range(m)])) / 2
-    between = Rotation.from_matrix(rec.R_cw[1:] @ rec.R_cw[:-1].transpose(0, 2, 1)).as_rotvec().mean(0)
+    phi, R_cw = (rec.phi * rec.frame_span()[:, None])[mine], rec.R_cw[mine]
+    half_px = float(rec.cameras[camera].K[0, 0]) / 2
+    between = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec().mean(0)
     # of all photos; and without the largest and smallest fifth, since photos that came out wrong hide what the others
     # have in common
     for trimmed in (0, m // 5):
         mean, spread, freedom = _trimmed_mean(phi, trimmed)
-        per_clock = np.abs(_trimmed_mean(rec.phi, trimmed)[0])
+        per_clock = np.abs(_trimmed_mean(rec.phi[mine], trimmed)[0])
         if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
             continue
         chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
         alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
         alike &= per_clock < most
         if alike.any():
-            return int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
+            axis = int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
+            return axis, float(np.mean(phi[:, axis]))
     return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import re
 import sys
 import warnings
 
@@ -46,6 +47,7 @@ __all__ = [
     "Photo",
     "check_compression",
     "list_photos",
+    "natural_order",
     "output_name",
     "read_photo",
     "read_plain",
@@ -91,8 +93,9 @@ class Photo:
 
 
 def list_photos(folder: Place | str, raw_as: str = "tif", sub_folders: Collection[str] = ()) -> list[str]:
-    """Names of the photos in a folder, by path or URL, sorted; files of other kinds and hidden ones are passed over.
+    """Names of the photos in a folder, by path or URL, 9.jpg before 10.jpg.
 
+    Files of other kinds and hidden ones are passed over.
     Of sub-folders only those named are looked into ("a", "a/b"), if they are there; their photos are "a/name.jpg".
     """
     folder = place_of(folder)
@@ -100,12 +103,13 @@ def list_photos(folder: Place | str, raw_as: str = "tif", sub_folders: Collectio
     if top is None:
         raise FileError(f"{folder} is no folder; give the folder that holds the photos")
     suffixes = PHOTO_SUFFIXES + HEIF_SUFFIXES + RAW_SUFFIXES
-    names = sorted(
+    found = (
         (PurePosixPath(within) / name).as_posix()
         for within, files in ((".", top), *((each, files_in(folder, each)) for each in sorted(sub_folders)))
         for name in files or ()
         if PurePosixPath(name).suffix.lower() in suffixes and not name.startswith(".")
     )
+    names = sorted(found, key=natural_order)
     outputs: dict[str, str] = {}
     for name in names:
         other = outputs.setdefault(output_name(name, raw_as), name)
@@ -121,6 +125,12 @@ def list_photos(folder: Place | str, raw_as: str = "tif", sub_folders: Collectio
             "are not searched"
         )
     return names
+
+
+def natural_order(name: str) -> tuple[tuple[int, str], ...]:
+    """Key that sorts 9.jpg before 10.jpg."""
+    parts = re.split(r"([0-9]+)", name)
+    return (*((int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)), (-1, name))
 
 
 def unread_pictures(folder: Path) -> list[str]:
