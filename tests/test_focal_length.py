@@ -116,7 +116,7 @@ def test_a_focal_length_is_called_weak_if_the_solution_leaves_it_so(recwarn, sig
     cameras = PhotoCameras([guess], ["a"], np.zeros(3, int), False, (False,), "", sigma=[{"f": 0.3}], without_focal=[0])
     warn_of_weak_focal_lengths(cameras, [guess], [sigmas], used)
     assert [str(each.message).startswith("the photos hardly determine") for each in recwarn] == [True] * said
-    warn_of_weak_focal_lengths(replace(cameras, without_focal=[]), [guess], [{"f": 100.0}])
+    warn_of_weak_focal_lengths(replace(cameras, without_focal=[]), [guess], [{"f": 100.0}], used)
     assert len(recwarn) == said
 
 
