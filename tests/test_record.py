@@ -26,6 +26,8 @@ from rsundistort.io.journal import Journal
 from rsundistort.io.outputs import _SCRATCH, batch_folder
 from rsundistort.io.places import place_of
 from rsundistort.io.record import Record
+from rsundistort.solve.run_options import OutputOptions
+from rsundistort.solve.run_outputs import remove_former
 
 THREE = ["a.png", "b.png", "c.png"]
 CAMERA = ["--camera", "300,300,160,120"]
@@ -447,3 +449,19 @@ def test_files_of_others_stay_by_url(invoke, inputs, memory):
         assert before
         assert invoke(*command).exit_code == 0
     assert Record(place_of(url)).ours(["images"]) == {f"images/{name}" for name in THREE}
+
+
+def test_what_an_earlier_run_wrote_and_this_one_does_not_is_removed(tmp_path):
+    names = ["solution.json", "rs-poses/transforms.json", "metashape/cameras.xml", "report.html", "camera.usda"]
+    with output_folder(tmp_path) as scratch:
+        for name in names:
+            (scratch / name).parent.mkdir(exist_ok=True)
+            (scratch / name).write_text("old")
+    (tmp_path / "metashape" / "mine.txt").write_text("mine")
+    (tmp_path / "camera.usda").write_text("changed")
+    remove_former(tmp_path, OutputOptions(exports=["metashape"], report=False))
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == {"solution.json", "metashape/cameras.xml", "metashape/mine.txt", "camera.usda", Record.NAME}
+    remove_former(tmp_path, OutputOptions(), ["camera.usda"])
+    assert not (tmp_path / "metashape" / "cameras.xml").exists()
+    assert (tmp_path / "metashape" / "mine.txt").exists()

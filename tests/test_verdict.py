@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from rsundistort.bundle import GuessedCameras, KnownMotions, ModelChoice, choose
 from rsundistort.bundle.common_motion import CommonMotion
 from rsundistort.critical import heal
 from rsundistort.rectify import largest_shift_px
+from rsundistort.solve.model_sequence import _lens_instead
 from rsundistort.verdict import Verdict, judge
 from rsundistort.verdict.judge import _repeated
 from rsundistort.verdict.photos import photo_motions
@@ -485,3 +487,33 @@ def test_displacements_of_photos_are_those_of_their_motions(model, rng):
     assert ((found.covered > 0.5) & (found.covered < 1.2)).all()
     # deviations are those of the errors
     assert ((found.sigma_px > 0.05) & (found.sigma_px < 2)).all()
+
+
+# ---------------------------------------------------------------- a lens that is none
+
+
+@pytest.mark.parametrize(
+    ("model", "error", "focal", "shift_px", "says"),
+    [
+        # what moves, or is misplaced, bends the lens
+        ("global", 9.0, 0.6, 200.0, "contradict each other"),
+        ("global", 9.0, 0.6, 0.0, "contradict each other"),
+        # a camera that is another one explains its photos
+        ("global", 1.1, 0.6, 0.0, ""),
+        ("global", 9.0, 1.0, 0.0, ""),
+        ("rotation", 9.0, 0.6, 0.0, ""),
+        # without its shutter
+        ("global", 1.1, 1.0, 200.0, "the model with a shutter found"),
+    ],
+)
+def test_a_lens_that_photos_in_contradiction_need_is_not_corrected(model, error, focal, shift_px, says):
+    K = CAMERA.K * [[focal, 1, 1], [1, focal, 1], [1, 1, 1]] + [[0, 0, shift_px], [0, 0, 0], [0, 0, 0]]
+    found = SimpleNamespace(reconstruction=SimpleNamespace(cameras=[replace(CAMERA, K=K)]), sigma_px=0.5)
+    start = SimpleNamespace(cameras=[replace(CAMERA, dist=(0.01, 0, 0, 0))])
+    guessed = GuessedCameras((CAMERA,), {"f": 0.05, "cx": 0.01})
+    cameras, why = _lens_instead(choice_of(model, error), found, start, guessed)
+    assert (says in why) if says else why == ""
+    if "contradict" in says:
+        assert cameras == [CAMERA]
+    elif says:
+        assert cameras == start.cameras

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from .held_out import BENDS
 from .known_motions import KnownMotions
 
@@ -12,6 +14,8 @@ __all__ = ["LEAST_RIVAL", "ModelChoice"]
 
 #: Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
 LEAST_RIVAL = 1 / 3
+# Mean error of held-out measurements, 1 for noise alone, and pixels beyond it, that noise does not explain.
+_NOT_NOISE, _HELD_OUT_PX = 2.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,12 @@ class ModelChoice:
     def has_rival(self) -> bool:
         """Whether a velocity explains the photos as well, and displaces them otherwise."""
         return self.rival >= LEAST_RIVAL
+
+    def unexplained_px(self, sigma_px: float) -> float:
+        """How far held-out measurements are off beyond their noise; 0 if by little more than noise, or half a pixel."""
+        error = self.held_out_error[self.label]
+        beyond_px = sigma_px * float(np.sqrt(max(error - 1.0, 0.0)))
+        return beyond_px if error > _NOT_NOISE and beyond_px > _HELD_OUT_PX else 0.0
 
     def with_velocity(self) -> ModelChoice:
         """The choice of a velocity beside steady rotations, if it was tried with the same lens; else this one."""

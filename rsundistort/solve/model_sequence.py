@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -18,6 +18,7 @@ from ..bundle import (
     MODEL_SEQUENCE,
     BundleOptions,
     BundleResult,
+    GuessedCameras,
     KnownMotions,
     ModelChoice,
     ReadoutChoice,
@@ -32,7 +33,7 @@ from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
-from ..model import Reconstruction
+from ..model import Camera, Reconstruction
 from ..sfm import read_num_verified
 from ..verdict import Verdict, judge
 from .outcome import Solved
@@ -322,16 +323,11 @@ def _chosen(
         how = replace(options, outlier_rounds=min(options.outlier_rounds, 1))
     start = replace(start, shutter_model=choice.shutter_model)
     result = bundle_adjust(start, choice.shutter_model, how, partial(tell, log, "choice"))
-    if choice.shutter != "found" and _is_no_lens(result.reconstruction, start):
-        # it makes up for a shutter; that of the model which has one does not
-        warnings.warn(
-            "without a shutter the photos would need a lens whose principal point lies far from that of any lens: they "
-            "are corrected for the lens that the model with a shutter found",
-            RsUndistortWarning,
-            stacklevel=4,
-        )
+    cameras, why = _lens_instead(choice, result, start, options.guessed)
+    if why:
+        warnings.warn(why, RsUndistortWarning, stacklevel=4)
         held: dict[str, Any] = {"refine": (), "guessed": None, "varying": False, "residual_field": False}
-        options = replace(options, **held)
+        options, start = replace(options, **held), replace(start, cameras=cameras)
         result = bundle_adjust(start, choice.shutter_model, replace(how, **held), partial(tell, log, "choice"))
     result = replace(result, num_outliers=result.num_outliers + outliers)
     log.end(
@@ -356,6 +352,29 @@ def _is_common(result: BundleResult, choice: ModelChoice, options: BundleOptions
     own = replace(options, bends=travelling.bends, rival={}, outlier_rounds=min(options.outlier_rounds, 1))
     found = bundle_adjust(result.reconstruction, "constant-motion", own, partial(tell, log, "choice"))
     return found.common is not None and found.common.is_certain
+
+
+def _lens_instead(
+    choice: ModelChoice, found: BundleResult, start: Reconstruction, guessed: GuessedCameras | None
+) -> tuple[Sequence[Camera], str]:
+    """A lens in place of one that was found without a shutter and is none; and why, "" if it is one."""
+    cameras = found.reconstruction.cameras
+    if choice.shutter == "found":
+        return cameras, ""
+    if guessed is not None and choice.unexplained_px(found.sigma_px) and guessed.surprises(cameras):
+        # things that move, or photos that are misplaced: what no lens explains says nothing about the lens
+        assumed = [replace(guess, readout=each.readout) for each, guess in zip(cameras, guessed.cameras, strict=True)]
+        return assumed, (
+            "the photos contradict each other, and would need a lens that is not the camera's: they are corrected for "
+            "the lens that was assumed before"
+        )
+    if _is_no_lens(found.reconstruction, start):
+        # it makes up for a shutter; that of the model which has one does not
+        return start.cameras, (
+            "without a shutter the photos would need a lens whose principal point lies far from that of any lens: they "
+            "are corrected for the lens that the model with a shutter found"
+        )
+    return cameras, ""
 
 
 def _is_no_lens(found: Reconstruction, start: Reconstruction) -> bool:

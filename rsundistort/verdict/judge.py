@@ -35,8 +35,6 @@ _SMALL_PERCENT = 0.5
 _LEFT_PX = 0.1
 # Largest residual field beside a lens model: with more, it is not the model of this lens.
 _FIELD_PX = 0.5
-# Largest error of held-out measurements beyond their noise.
-_HELD_OUT_PX = 0.5
 # Standard deviations that the motion of some photo must exceed, root mean square over the frame: errors alone do so in
 # one photo of 20 if one component decides, in one of 140 if all three do.
 _EVIDENT = 2.0
@@ -248,14 +246,12 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
             "is not the model of this lens."
         )
     if choice is not None:
-        error = choice.held_out_error[choice.label]
-        beyond_px = result.sigma_px * float(np.sqrt(max(error - 1.0, 0.0)))
         if choice.restless:
             reasons.append(
                 "The lines of the photos move faster than the motions that are modelled: the camera shook at more than "
                 "five periods a frame, or the photos were stabilised line by line."
             )
-        if error > 2.0 and beyond_px > _HELD_OUT_PX:
+        if (beyond_px := choice.unexplained_px(result.sigma_px)) > 0:
             reasons.append(
                 f"Held-out measurements are off by {beyond_px:.1f} px more than their noise explains; exclude what "
                 "moves, if it is large (--masks)."
