@@ -44,7 +44,7 @@ def solve(monkeypatch):
             return FoundPath(CLIP, scene, BundleOptions(path=PATH), filmed)
 
         found = turned and FoundPath(CLIP, turned, BundleOptions(path=replace(PATH, rotation_only=True)))
-        monkeypatch.setattr(video_path, "_only_rotated", lambda *_: (found, explained))
+        monkeypatch.setattr(video_path, "_only_rotated", lambda *_: (found, "by rotations" if explained else ""))
         monkeypatch.setattr(video_path, "_travelled", travelled)
         return video_path.solve_clip(CLIP, keys_of(Camera(64, 36, np.eye(3))), PATH, None, None, StageLog(None))
 

@@ -39,6 +39,9 @@ _FARTHEST = 12.0
 # Frames rotate as the gyroscope says except for the focal length, which may be wrong by a fifth.
 _ROTATION_SHARE = 0.75
 _FEWEST = 10
+# Of the changes of the lines' rotations: those from frame to frame of a camera that vibrates faster than its frames
+# show are about as large, those of stabilised frames a thirtieth.
+_JUMPS = 0.5
 # Half a period of a hand's shaking.
 _CHANGE_S = 0.1
 # Frames with correlated rotations: this many lie between key frames, whose points they show.
@@ -92,6 +95,9 @@ class Stabilisation:
     beyond_frames : bool
         Whether the lines change their rotation by more than the frames do in all of the time from one to the next: no
         readout takes longer, and false poses only make the frames seem to rotate by more.
+    frames_jump : bool
+        Whether the rotation from frame to frame changes by as much as that of the lines does: frames that a stabiliser
+        rotated are smooth, those of a camera that vibrates are not.
     read_at_once : bool
         Whether the frames rotate and their lines show less of it than the fastest rolling shutter does: that of a
         global shutter, or of a camera that took its shutter out.
@@ -107,6 +113,7 @@ class Stabilisation:
     shutter_by_gyro: Regression | None = None
     beyond_frames: bool = False
     read_at_once: bool = False
+    frames_jump: bool = False
 
     @property
     def shows_shaking(self) -> bool:
@@ -185,7 +192,8 @@ def judge_stabilisation(
         length = readout_s or 0.5 * interval
         within = -log.mean(times + offset_s - length / 2, times + offset_s + length / 2)
         shutter_by_gyro = _of_lines(phi, within, phi_noise, interval)[0]
-    found = Stabilisation("unknown", "", shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
+    jump = _jump(vectors, joined, phi)
+    found = Stabilisation("unknown", "", shutter, changes, frames_by_gyro, shutter_by_gyro, beyond, frames_jump=jump)
     verdict, reason = _judge(found, interval, readout_s)
     fastest = _FASTEST * interval
     at_once = _SIGMAS * shutter.reach < fastest and abs(shutter.slope) + _SIGMAS * shutter.sigma < fastest
@@ -206,6 +214,15 @@ def _of_lines(phi: Array, rate: Array, noise: Array, interval: float) -> tuple[R
     in_lines, in_frames = (np.linalg.norm(each[known], axis=1) for each in (lines, frames))
     beyond = bool(known.any()) and float(np.median(in_lines)) > interval * float(np.median(in_frames))
     return min(levels, changes, key=lambda found: found.sigma), changes, beyond
+
+
+def _jump(rotations: Array, pairs: NDArray[np.integer], phi: Array) -> bool:
+    """Whether rotations from frame to frame change by as much, in the middle, as those of the lines."""
+    follows = pairs[1:, 0] == pairs[:-1, 1]
+    steps = np.linalg.norm(np.diff(rotations, axis=0)[follows], axis=1)
+    lines = np.linalg.norm((phi[pairs[1:, 0]] - phi[pairs[:-1, 0]])[follows], axis=1)
+    known = np.isfinite(steps) & np.isfinite(lines)
+    return bool(known.any()) and float(np.median(steps[known])) > _JUMPS * float(np.median(lines[known]))
 
 
 def calmer_than_felt(
@@ -337,10 +354,15 @@ def _judge(
         return "stabilised", line
     detectable = _SIGMAS * shutter.reach < least
     if evidence.shows_shaking:
+        unseen = f"{changes.unexplained / changes.signal:.0%} of what the lines show is not in the rotation between the"
+        if evidence.frames_jump:
+            return "stabilised", (
+                f"shakes faster than {0.5 / interval:.0f} Hz, which no path through its frames follows, or was "
+                f"stabilised in part: {unseen} frames (readout {found})"
+            )
         return "stabilised", (
-            f"stabilised in the camera: a shutter without its rotation, {changes.unexplained / changes.signal:.0%} of "
-            f"what the lines show is not in the rotation between the frames (readout {found}); shaking faster than "
-            f"{0.5 / interval:.0f} Hz looks the same"
+            f"stabilised in the camera: a shutter without its rotation, {unseen} frames (readout {found}); shaking "
+            f"faster than {0.5 / interval:.0f} Hz looks the same"
         )
     if detectable and high < -least and low > -most:
         # a stabilised video has lost its rotation or its shutter, and here are both

@@ -76,8 +76,8 @@ def guess_readouts(
     count = sum(readouts[group] == across for group in groups)
     if not count:
         return readouts, []
-    photos, were, are = ("photo", "was", "is") if count == 1 else ("photos", "were", "are")
+    photos, were, they = ("photo", "was", "it is") if count == 1 else ("photos", "were", "they are")
     return readouts, [
         f"{count} portrait {photos} of a camera that took landscape ones too {were} rotated after readout, to go by "
-        f"the missing orientation tag: {are} taken as read out {across}, the others {readout}"
+        f"the missing orientation tag; {they} taken as read out {across}, the others {readout}"
     ]

@@ -40,6 +40,9 @@ SIFT_PX = 0.12
 _COARSE_PX = 3.0
 # A photo full of texture shows a feature for about so many pixels (herz-jesus-8: 82 to 97).
 _PIXELS_PER_FEATURE = 80
+# With fewer than one feature for so many pixels a photo is searched again, as if its contrast filled the range: these
+# percentiles of its pixels, but for a tenth of it at least, where noise is all that there is.
+_FEW_FEATURES, _CONTRAST, _LEAST_CONTRAST = 2000, (1.0, 99.0), 0.1
 # What OpenCV's SIFT holds for each pixel (measured).
 _BYTES_PER_PIXEL = 245
 
@@ -138,13 +141,17 @@ def detect_features(
     """
     reduced = reduce_photo(photo, mask, megapixels)
     gray = reduced.gray
-    # the upscaled first octave is off by a quarter of a pixel without the precise option (measured on blobs)
-    sift = cv2.SIFT.create(
-        nfeatures=0, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6, enable_precise_upscale=True
-    )
     # descriptors that are not kept cost more than a second pyramid, except where few are left out
     at_once = gray.size < _PIXELS_PER_FEATURE * max_features
-    keypoints, raw = sift.detectAndCompute(gray, reduced.mask) if at_once else (sift.detect(gray, reduced.mask), None)
+    sift, raw = _sift(1.0), None
+    keypoints = () if at_once else sift.detect(gray, reduced.mask)
+    if at_once:
+        keypoints, raw = sift.detectAndCompute(gray, reduced.mask)
+    shown = gray.size if reduced.mask is None else np.count_nonzero(reduced.mask)
+    if _FEW_FEATURES * len(keypoints) < shown:
+        range_of = np.diff(np.percentile(gray, _CONTRAST))[0] / 255
+        sift = _sift(float(np.clip(range_of, _LEAST_CONTRAST, 1.0)))
+        keypoints, raw = sift.detectAndCompute(gray, reduced.mask)
     if not keypoints:
         return features_of(reduced, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
     x, y, size, angle, response = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints]).T
@@ -159,6 +166,15 @@ def detect_features(
     descriptors = np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)
     xy, size = np.asarray(cv2.KeyPoint.convert(kept), np.float64), np.array([k.size for k in kept])
     return features_of(reduced, xy, size, descriptors)
+
+
+def _sift(contrast: float) -> Any:
+    """OpenCV's detector, for photos whose contrast is this share of the range."""
+    # the upscaled first octave is off by a quarter of a pixel without the precise option (measured on blobs)
+    return cv2.SIFT.create(
+        nfeatures=0, nOctaveLayers=3, contrastThreshold=0.02 * contrast, edgeThreshold=10, sigma=1.6,
+        enable_precise_upscale=True,
+    )  # fmt: skip
 
 
 def reduce_photo(

@@ -15,7 +15,9 @@ from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches, photo_pair
 __all__ = ["retriangulate"]
 
 
-def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_two: bool = False) -> Reconstruction:
+def retriangulate(
+    matched: MatchedPhotos, reconstruction: Reconstruction, *, of_two: bool = False, least_deg: float | None = None
+) -> Reconstruction:
     """New tracks and points for a reconstruction's poses, from keypoints without shutter.
 
     The keypoints are corrected by the reconstruction's motion, and matches that fit its poses are triangulated with
@@ -28,6 +30,8 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
         Keypoints and matches of at least the reconstruction's photos.
     of_two : bool
         Whether points that only two photos show are among the new ones: `align_tracks` may find them in others.
+    least_deg : float, optional
+        Rays of a point meet at this angle or a larger one; by default at COLMAP's, 1.5 degrees.
 
     Returns
     -------
@@ -58,6 +62,8 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
             db.write_two_view_geometry(first + 1, second + 1, geometry)
     empty = _posed_model(matched, reconstruction)
     options = pipeline_options(1.0, matched.seed, False, len(matched.names))
+    if least_deg is not None:
+        options.mapper.filter_min_tri_angle = options.triangulation.min_angle = least_deg
     options.mapper.filter_max_reproj_error = tight_px
     options.triangulation.merge_max_reproj_error = tight_px
     options.triangulation.complete_max_reproj_error = tight_px

@@ -25,7 +25,7 @@ from .clip_gyroscope import Felt, readout_of
 from .clip_stabilisation import against_telemetry, stabilisation_of, was_stabilised
 from .model_sequence import without_shutter
 from .outcome import Solved
-from .shaking import speeds_of, with_slow_rotations
+from .shaking import speeds_of, tell_if_held, with_slow_rotations
 from .tracks import rough_options
 
 __all__ = ["FoundPath", "judged", "readouts_of_halves"]
@@ -100,6 +100,8 @@ def judged(
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
     tested = _tested(found, telemetry, log, at_once)
     result, stabilisation = tested.result, tested.stabilisation
+    if stabilisation.verdict != "stabilised":
+        tell_if_held(found.path)
     of_keys = result.of_photos(clip.are_keys(result.reconstruction.image_names))
     log.begin("comparison with a global shutter")
     global_result = _read_at_once(found, result, of_keys)

@@ -358,17 +358,19 @@ def _lens_instead(
     choice: ModelChoice, found: BundleResult, start: Reconstruction, guessed: GuessedCameras | None
 ) -> tuple[Sequence[Camera], str]:
     """A lens in place of one that was found without a shutter and is none; and why, "" if it is one."""
-    cameras = found.reconstruction.cameras
+    cameras, unexplained = found.reconstruction.cameras, choice.unexplained_px(found.sigma_px) > 0
     if choice.shutter == "found":
         return cameras, ""
-    if guessed is not None and choice.unexplained_px(found.sigma_px) and guessed.surprises(cameras):
+    if guessed is not None and unexplained and guessed.surprises(cameras):
         # things that move, or photos that are misplaced: what no lens explains says nothing about the lens
         assumed = [replace(guess, readout=each.readout) for each, guess in zip(cameras, guessed.cameras, strict=True)]
         return assumed, (
             "the photos contradict each other, and would need a lens that is not the camera's: they are corrected for "
             "the lens that was assumed before"
         )
-    if _is_no_lens(found.reconstruction, start):
+    # nor does what no shutter explains say anything about the lens
+    has_other = guessed is None or not (unexplained and guessed.surprises(start.cameras))
+    if has_other and _is_no_lens(cameras, start.cameras):
         # it makes up for a shutter; that of the model which has one does not
         return start.cameras, (
             "without a shutter the photos would need a lens whose principal point lies far from that of any lens: they "
@@ -377,11 +379,11 @@ def _lens_instead(
     return cameras, ""
 
 
-def _is_no_lens(found: Reconstruction, start: Reconstruction) -> bool:
+def _is_no_lens(found: Sequence[Camera], start: Sequence[Camera]) -> bool:
     """Whether a camera's principal point went so far from where a shutter model has it that it is no lens any more."""
     return any(
         (np.abs(new.K[:2, 2] - old.K[:2, 2]) > _NO_LENS * np.array([new.width, new.height])).any()
-        for new, old in zip(found.cameras, start.cameras, strict=True)
+        for new, old in zip(found, start, strict=True)
     )
 
 

@@ -21,6 +21,7 @@ from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, ve
 from ..sfm.database import without_motions
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, close_px, match_more
+from .tracks import NO_PARALLAX
 
 __all__ = ["OF_CLIP", "match_without_motions", "place_photos"]
 
@@ -83,10 +84,7 @@ def place_photos(
             overlapping = sum(count >= _MANY for count in read_num_verified(matched).values())
             if overlapping < len(photos.names) - 1:
                 raise
-            raise ReconstructionError(
-                "the photos overlap, but show no parallax: the camera stood still or only rotated; "
-                "use photos from places apart"
-            ) from error
+            raise ReconstructionError(NO_PARALLAX) from error
         kept.put(key, mapped)
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
     return mapped, matched

@@ -20,6 +20,8 @@ __all__ = ["held_by_slow_rotations", "speeds_of", "tell_if_held", "with_slow_rot
 # Share of what lines show that may not be in the frames: 0.01 at most where a path follows its camera, 0.3 and more
 # where it does not.
 _UNFOLLOWED = 0.1
+# A smaller displacement by what is not in the frames, in pixels, is what lens and scene leave.
+_UNFOLLOWED_PX = 0.1
 # The readout time of slow rotations is one if it is known to this share of itself.
 _KNOWN = 0.5
 # Standard deviation that holds a readout time, by its own: it must not move where a path pulls it.
@@ -55,6 +57,8 @@ def held_by_slow_rotations(
     for _ in range(2):  # lines average over the readout, so that it counts a little
         speeds = speeds_of(clip, rec, found, about, fills=fills)
         if speeds is None or speeds.slow is None or not speeds.unfollowed > _UNFOLLOWED:
+            return path
+        if speeds.unfollowed_rad * rec.cameras[0].K[0, 0] < _UNFOLLOWED_PX:
             return path
         seconds, sigma = speeds.slow
         about = seconds

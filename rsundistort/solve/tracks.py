@@ -23,6 +23,7 @@ from .depth_reversal import choose_depths
 
 __all__ = [
     "LEAST_PHOTOS",
+    "NO_PARALLAX",
     "TrackSource",
     "adjusted_sequence",
     "check_enough",
@@ -46,6 +47,12 @@ _MAX_ROUNDS = 4
 # A photo that rotated by more during its readout, in radians, was mapped by thresholds that were not made for it: its
 # pose may be wrong, and is checked with the points of the others.
 _STRONG_RAD = 0.1
+# Photos whose places lie within this share of the distance of the scene show hardly any parallax.
+_NO_PARALLAX = 0.05
+#: Said of them.
+NO_PARALLAX = (
+    "the photos overlap, but show no parallax: the camera stood still or only rotated; use photos from places apart"
+)
 # Places along each side of a photo where a change is measured.
 _LOOKED_AT = 5
 
@@ -139,9 +146,11 @@ def is_strong(rec: Reconstruction) -> bool:
     return bool((np.linalg.norm(rec.phi, axis=1) * rec.frame_span()).max() > _STRONG_RAD)
 
 
-def check_enough(registered: Reconstruction, total: int) -> None:
-    """Refuse too few photos for a shutter."""
+def check_enough(registered: Reconstruction, total: int, before: Reconstruction | None = None) -> None:
+    """Refuse too few photos for a shutter; photos that have tracks no more had no parallax, if they stand together."""
     if registered.num_images < LEAST_PHOTOS:
+        if before is not None and np.linalg.norm(np.ptp(before.center_w, axis=0)) < _NO_PARALLAX * before.size:
+            raise ReconstructionError(NO_PARALLAX)
         raise ReconstructionError(
             f"only {registered.num_images} of {total} photos could be registered, the shutter needs three; "
             "use photos that share more of the scene, or check the camera's focal length"
@@ -211,7 +220,7 @@ def retriangulated(
                 continue
         found, drawn = tracks, None
         tracks = firmly_connected(tracks)
-        check_enough(tracks, len(track_source.matched.names))
+        check_enough(tracks, len(track_source.matched.names), before)
         options = of_registered(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_rms)
         how = options if ends and aligns else rough_options(options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -34,7 +35,7 @@ from .clip_verdict import FoundPath, judged
 from .missing_frames import tell_of_gaps, with_gaps
 from .outcome import Solved
 from .placing import OF_CLIP, place_photos
-from .shaking import held_by_slow_rotations, tell_if_held
+from .shaking import held_by_slow_rotations
 from .tracks import rough_options, tell
 
 __all__ = ["frame_path", "solve_clip"]
@@ -61,6 +62,8 @@ _FOCUSES = 5e-4
 # A scene is mapped again by the focal length that its path found, and a path is found again, if focal lengths differ by
 # these shares; so many times.
 _MAPPED_BY, _SOLVED_BY, _LENS_ROUNDS = 0.05, 0.03, 3
+# If new points are fewer than this share of those before, rays may meet at this angle: ten times what pixels measure.
+_LEAST_SHARE, _LEAST_DEG = 0.3, 0.2
 # Standard deviation of a readout time, as a share of the time between frames, that no false axis of it leaves.
 _CLEAR = 0.01
 # Relative standard deviation of a readout time that is specified, or from the table.
@@ -128,7 +131,6 @@ def solve_clip(
             "the camera only rotated: without parallax there are directions, but no positions and no scene",
             RsUndistortWarning, stacklevel=3,
         )  # fmt: skip
-    tell_if_held(found.path)
     alone = readout_of(found.result)
     # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
     of_camera = None if was_stabilised(found.filmed) and not at_once else gyroscope or telemetry
@@ -164,7 +166,7 @@ def _filmed_by(
 ) -> FoundPath:  # fmt: skip
     """The path of the camera: of one that only rotates, through two frames, or of one that travels."""
     rotated, explained = _only_rotated(clip, keys, path, options_of, log)
-    if rotated is not None and explained:
+    if rotated is not None and explained == "by rotations":
         return rotated
     if len(clip.names) == 2:
         return _of_two(clip, keys, path, options_of, log)
@@ -181,9 +183,11 @@ def _filmed_by(
         if rotated is None:
             raise
         return rotated
-    if rotated is not None and _shows_readout(rotated) and not _shows_readout(found):
-        return rotated
-    return found
+    if rotated is None:
+        return found
+    # a camera that zooms looks like one that travels; what explains the frames better did
+    explains = explained == "by zooming" and rotated.result.sigma_px <= found.result.sigma_px
+    return rotated if explains or (_shows_readout(rotated) and not _shows_readout(found)) else found
 
 
 def _with_gyroscope(
@@ -205,27 +209,46 @@ def _with_gyroscope(
 def _only_rotated(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
-) -> tuple[FoundPath | None, bool]:  # fmt: skip
-    """The path of a camera that only rotates, if that explains neighbours; and whether it explains all frames."""
+) -> tuple[FoundPath | None, str]:  # fmt: skip
+    """The path of a camera that only rotates, if that explains neighbours; and by what it explains all frames.
+
+    "by rotations" of one lens, or "by zooming", too: by a focal length that varies, which takes travel for zoom; "" if
+    by neither.
+    """
     log.begin("rotations")
-    start, found, explained = rotating_only(clip, keys), None, False
+    start, found, explained = rotating_only(clip, keys), None, ""
     if start is not None:
         path = replace(path, rotation_only=True)
         options = replace(options_of(start), path=path)
         # a focal length that the rotations said would absorb wild ones, which the path smooths yet
         said = start.cameras[0] != keys.cameras.of(0)
         rough = replace(options, refine=()) if said else options
-        result, own, clip, path = _rotated_in_time(clip, path, start, rough, log)
-        if own is not None:
-            held = held_by_slow_rotations(clip, result.reconstruction, path, own)
-            result, options = _rotated_again(result, replace(options, path=held), log)
-            # what a rough path does not follow, a better one may
-            if held.held_sigma and not _is_held(clip, path, result):
-                result, options = _rotated_again(result, replace(options, path=path), log)
-            dropped = 1 - len(result.reconstruction.observations) / len(start.observations)
-            found, explained = FoundPath(clip, result, options), result.sigma_px < _FLOW_PX and dropped < _OUTLIERS
+        for varying, how in ((False, "by rotations"), (True, "by zooming")):
+            other = _rotated_as_filmed(clip, path, start, options, replace(rough, varying=varying), log)
+            if other is None:
+                continue
+            dropped = 1 - len(other.result.reconstruction.observations) / len(start.observations)
+            if other.result.sigma_px < _FLOW_PX and dropped < _OUTLIERS:
+                found, explained = other, how
+                break
+            found = found or other
     log.end("rotations", explained=explained)
     return found, explained
+
+
+def _rotated_as_filmed(
+    clip: Clip, path: FramePath, start: Reconstruction, options: BundleOptions, rough: BundleOptions, log: StageLog
+) -> FoundPath | None:
+    """The path of frames that only rotate, by `rough` options at first; None if rotations do not explain them."""
+    result, own, clip, path = _rotated_in_time(clip, path, start, rough, log)
+    if own is None:
+        return None
+    held = held_by_slow_rotations(clip, result.reconstruction, path, own)
+    result, options = _rotated_again(result, replace(options, path=held), log)
+    # what a rough path does not follow, a better one may
+    if held.held_sigma and not _is_held(clip, path, result):
+        result, options = _rotated_again(result, replace(options, path=path), log)
+    return FoundPath(clip, result, options)
 
 
 def _rotated_in_time(
@@ -238,7 +261,7 @@ def _rotated_in_time(
     """
     as_said, rounds = (clip, path), 0
     while True:
-        how = _at_first(replace(options, path=path))
+        how = replace(_at_first(replace(options, path=path)), varying=options.varying)
         result = bundle_adjust(start, "constant-motion", how, partial(tell, log, "rotations"))
         # it smooths wild rotations, which leaves an error several times as large as that of the next one
         if result.sigma_px >= _AT_FIRST * _FLOW_PX:
@@ -370,10 +393,8 @@ def _first_path(
     path, filmed = as_filmed(clip, whole, path, telemetry, own)
     held = path if was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
     options = replace(options_of(whole), path=held)
-    if matched.calibrated:
-        result = bundle_adjust(whole, "constant-motion", _at_first(options), partial(tell, log, "path"))
-    else:
-        result = _with_unknown_lens(whole, _at_first(options), log)
+    by_lens = _with_known_lens if matched.calibrated else _with_unknown_lens
+    result = by_lens(whole, _at_first(options), log)
     _end_path(log, "path", clip, whole, result)
     return _TravelledPath(clip, path, options, filmed, result, scene, followed)
 
@@ -386,7 +407,7 @@ def _path_again(
     assert held is not None
     on_path = result.reconstruction
     # key frames without shutter
-    scene = retriangulate(matched, result.of_photos(clip.are_keys(on_path.image_names)).reconstruction)
+    scene = _new_points(matched, result.of_photos(clip.are_keys(on_path.image_names)).reconstruction)
     followed = followed_again(clip, first.followed, first.scene, scene)
     log.begin("path again")
     whole = focused_as(on_path, with_all_frames(clip, scene, followed, on_path).without_photos(_LEAST_MEASUREMENTS))
@@ -397,6 +418,16 @@ def _path_again(
     result = bundle_adjust(whole, "constant-motion", how, partial(tell, log, "path again"))
     _end_path(log, "path again", clip, whole, result)
     return replace(first, options=options, result=result, scene=scene, followed=followed)
+
+
+def _new_points(matched: MatchedPhotos, keys: Reconstruction) -> Reconstruction:
+    """New points of the key frames; of short clips, whose frames lie close together, those of small angles, too."""
+    scene = None
+    with suppress(ReconstructionError):
+        scene = retriangulate(matched, keys)
+    if scene is None or scene.num_points < _LEAST_SHARE * keys.num_points:
+        scene = retriangulate(matched, keys, least_deg=_LEAST_DEG)
+    return scene
 
 
 def _with_unknown_lens(whole: Reconstruction, options: BundleOptions, log: StageLog) -> BundleResult:
@@ -411,7 +442,24 @@ def _with_unknown_lens(whole: Reconstruction, options: BundleOptions, log: Stage
     # both at once run away: a scene that zooms in may as well come nearer
     options = replace(options, refine=(), path=replace(options.path, start=steady.path_start()))
     varying = bundle_adjust(steady.reconstruction, "constant-motion", options, partial(tell, log, "path"))
-    return varying if varying.sigma_px**2 < (1 - MIN_FALL) * steady.sigma_px**2 else steady
+    return varying if _explains_more(varying, steady) else steady
+
+
+def _with_known_lens(whole: Reconstruction, options: BundleOptions, log: StageLog) -> BundleResult:
+    """A path by a focal length that varies; by one of all frames, if that one varies and explains them no better.
+
+    A focal length that varies takes travel for zoom.
+    """
+    varying = bundle_adjust(whole, "constant-motion", options, partial(tell, log, "path"))
+    if varying.focal_sigma < _FOCUSES:
+        return varying
+    steady = bundle_adjust(whole, "constant-motion", replace(options, varying=False), partial(tell, log, "path"))
+    return varying if _explains_more(varying, steady) else steady
+
+
+def _explains_more(varying: BundleResult, steady: BundleResult) -> bool:
+    """Whether a lens that varies explains the frames better."""
+    return bool(varying.sigma_px**2 < (1 - MIN_FALL) * steady.sigma_px**2)
 
 
 def _is_other_lens(found: BundleResult, assumed: Camera, tolerance: float) -> bool:

@@ -430,8 +430,6 @@ def _doubts(
             said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
         if motions.difference_px[i] > UNSEEN_PX:
             said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
-        if motions.sigma_px[i] > _UNCERTAIN_PX:
-            said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
         if times[i] > _FAR and motions.shift_px[i] > UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
         most = 2 * phi_limits.get(name, np.inf)
@@ -465,7 +463,7 @@ def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
     over the frame, as a photo is judged.
     """
     found, sigma = motions.shift_px, motions.sigma_px
-    faint = (motions.relative_sigma > 1 / 4) & (sigma > UNSEEN_PX / 2)
+    faint = ((motions.relative_sigma > 1 / 4) & (sigma > UNSEEN_PX / 2)) | (sigma > _UNCERTAIN_PX)
     return {
         name: f"its motion of {found[i]:.1f} px is only known to +-{sigma[i]:.1f} px"
         for i, name in enumerate(rec.image_names)

@@ -50,11 +50,14 @@ class BySpeed(NamedTuple):
     unfollowed : float
         Share of the power of the lines' rotations that is not in those of the frames at the readout time by slow ones,
         significantly beyond the noise of both: 0 if they agree, 1 or more if they have nothing to do with each other.
+    unfollowed_rad : float
+        The same as a rotation: root mean square over the frames.
     """
 
     slow: ReadoutTime | None
     fast: ReadoutTime | None
     unfollowed: float
+    unfollowed_rad: float = 0.0
 
 
 class _Run(NamedTuple):
@@ -124,13 +127,13 @@ def readouts_by_speed(
         kinds.append((at, max(share, 0.0)))
     (slow_s, of_slow), (fast_s, of_fast) = kinds
     if slow_s is None:
-        return BySpeed(None, None, found.unfollowed)
+        return BySpeed(None, None, found.unfollowed, found.unfollowed_rad)
     there = _compared(runs, slow_s, step_s)
     slow, fast = (
         None if at is None or each is None else ReadoutTime(at, wider * each.sigma / (1 - share))
         for at, each, share in ((slow_s, there.slow, of_slow), (fast_s, there.fast, of_fast))
     )
-    return BySpeed(slow, fast, there.unfollowed)
+    return BySpeed(slow, fast, there.unfollowed, there.unfollowed_rad)
 
 
 def _in_a_row(time_s: Array, part: Index, step_s: float, fills: bool) -> list[Index]:
@@ -166,7 +169,10 @@ def _compared(runs: Sequence[_Run], readout_s: float, step_s: float) -> BySpeed:
     # of frames that hardly rotate the noise alone leaves a share; its power at a frequency scatters by itself
     left -= min(max(left, 0.0), _BEYOND * float(np.sqrt(_TOGETHER * (noise**2).sum())))
     power = float((np.abs(lines) ** 2).sum()) - float(line_noise.sum())
-    return BySpeed(slow, rest, left / power if power > line_noise.sum() else 0.0)
+    # Parseval's: of m frames under a Hann window, over the half of the frequencies that is looked at
+    frames = [int(_places(run, step_s)[-1]) + 1 for run in runs]
+    size = np.sqrt(max(left, 0.0) / sum(3 / 16 * m**2 for m in frames))
+    return BySpeed(slow, rest, left / power if power > line_noise.sum() else 0.0, float(size))
 
 
 def _places(run: _Run, step_s: float) -> Index:
