@@ -71,7 +71,7 @@ def test_slow_and_fast_rotations_of_a_hand_ask_for_the_same_readout_time(rng, re
 
 @pytest.mark.parametrize("hz", [15.7, 17.0, 20.0])
 def test_a_vibration_faster_than_half_of_the_frame_rate_runs_the_other_way(rng, hz):
-    slow, fast, unfollowed = by_speed(shaken(1, hz, 0.003), rng)
+    slow, fast, unfollowed, _ = by_speed(shaken(1, hz, 0.003), rng)
     assert unfollowed > 0.2
     assert abs(slow.seconds - 0.02) < 4 * slow.sigma
     # what the frames show has a rate of this share of that of the lines, and its sign is the other
@@ -87,7 +87,7 @@ def test_a_vibration_faster_than_half_of_the_frame_rate_runs_the_other_way(rng, 
 
 
 def test_a_path_that_slow_rotations_contradict_is_no_measurement(rng):
-    slow, fast, _ = by_speed(shaken(1, 9.0, 0.003), rng)
+    slow, fast, *_ = by_speed(shaken(1, 9.0, 0.003), rng)
     speeds = {"by_speed": [each._asdict() for each in (slow, fast)]}
     told = {"sigma": 0.0003, "of_frame": 0.72, "source": "the video"} | speeds
     assert problem_of(told | {"seconds": slow.seconds + 0.0002}) == ""
@@ -99,7 +99,7 @@ def test_a_readout_against_its_direction_has_the_same_sign_at_all_speeds(rng):
     time_s = np.arange(60) * FRAME_S
     R_cw, phi = lines_of(hand, time_s, 0.02)
     sigma = np.full((60, 3), NOISE)
-    slow, fast, _ = readouts_by_speed(time_s, np.zeros(60, int), R_cw, sigma, -phi, sigma, -0.02)
+    slow, fast, *_ = readouts_by_speed(time_s, np.zeros(60, int), R_cw, sigma, -phi, sigma, -0.02)
     assert slow.seconds == pytest.approx(-0.02, rel=0.02)
     assert fast.seconds == pytest.approx(-0.02, rel=0.05)
     told = {"seconds": -0.02, "sigma": 0.0005, "of_frame": -0.6, "source": "the video"}
@@ -113,7 +113,7 @@ def test_nothing_is_said_of_few_frames_of_gaps_or_of_rotations_lost_in_the_noise
     assert by_speed(shaken(1, 9.0, 0.003), rng, num=40, part=np.repeat([0, 1], 20)) is None
     assert by_speed(shaken(1, 9.0, 0.003), rng, num=48, without=range(22, 26)) is None
     still = by_speed(lambda time_s: np.tile(np.eye(3), (len(time_s), 1, 1)), rng)
-    assert still == (None, None, 0.0)
+    assert still == (None, None, 0.0, 0.0)
 
 
 MISSING = {"here and there": (4, 11, 20, 21, 35, 42, 51, 52), "converted": range(2, 60, 6)}
@@ -137,7 +137,7 @@ def test_frames_that_are_missing_are_filled_in(rng, without, wrong):
 @pytest.mark.parametrize("without", MISSING.values(), ids=MISSING)
 @pytest.mark.parametrize("hz", [17.0, 20.0])
 def test_a_fast_vibration_shows_also_where_frames_are_missing(rng, without, hz):
-    slow, _, unfollowed = by_speed(shaken(1, hz, 0.003), rng, without=without)
+    slow, _, unfollowed, _ = by_speed(shaken(1, hz, 0.003), rng, without=without)
     assert unfollowed > 0.15
     assert abs(slow.seconds - 0.02) < 4 * slow.sigma
 

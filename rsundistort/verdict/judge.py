@@ -162,7 +162,7 @@ def judge(
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
     for name, said in _faint(rec, motions).items():
-        doubts[name] = doubts[name] or [said]
+        doubts[name].append(said)
     # pose and motion are one estimate: what contradicts the one does not support the other
     lost = torn | np.isin(rec.image_names, [*suspects])
     lost |= unsupported
