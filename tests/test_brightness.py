@@ -117,3 +117,14 @@ def test_the_report_and_points_show_their_colours(photo, dtype):
     np.testing.assert_allclose(_colors(Photo(seen), xy), photo[xy[:, 1], xy[:, 0], ::-1], atol=1.0)
     whole = texture(64, 48).astype(np.uint16) * 257
     assert np.array_equal(_as_bytes(whole), texture(64, 48))
+
+
+def test_a_photo_of_low_contrast_is_searched_as_if_it_filled_the_range():
+    photo = texture(320, 240, 3, 1)
+    flat = (100 + 12 * (photo / 255.0)).round().astype(np.uint8)
+    found = detect_features(flat)
+    assert len(found.xy_raw) > 0.3 * len(detect_features(photo).xy_raw)
+    # where there is nothing but noise of the last bit, there are hardly any features
+    noise = np.random.default_rng(0).integers(100, 102, (240, 320)).astype(np.uint8)
+    assert len(detect_features(noise).xy_raw) < 0.1 * len(found.xy_raw)
+    assert len(detect_features(np.full((240, 320), 100, np.uint8)).xy_raw) == 0

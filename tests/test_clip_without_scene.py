@@ -145,3 +145,16 @@ def test_frames_that_fit_along_no_axis_say_why(monkeypatch):
     monkeypatch.setattr(video_path, "own_gyroscope", lambda _: None)
     with pytest.raises(ReconstructionError, match="no scene point"):
         video_path.solve_clip(CLIP, keys_of(UPRIGHT), PATH, None, None, StageLog(None))
+
+
+@pytest.mark.parametrize(("by_zoom_px", "by_travel_px", "expected"), [(0.1, 0.2, TURNED), (0.2, 0.1, TRAVELLED)])
+def test_a_zoom_that_travel_explains_better_is_none(monkeypatch, by_zoom_px, by_travel_px, expected):
+    def found(what, sigma_px):
+        return FoundPath(CLIP, SimpleNamespace(what=what, sigma_px=sigma_px), BundleOptions(path=PATH))
+
+    monkeypatch.setattr(video_path, "_only_rotated", lambda *_: (found(TURNED, by_zoom_px), "by zooming"))
+    monkeypatch.setattr(video_path, "_travelled", lambda *_: found(TRAVELLED, by_travel_px))
+    monkeypatch.setattr(video_path, "readout_of", lambda _: ReadoutTime(0.01, 0.001))
+    keys = keys_of(Camera(64, 36, np.eye(3)))
+    chosen = video_path._filmed_by(CLIP, keys, PATH, None, StageLog(None), None, lambda: (None, None))
+    assert chosen.result.what == expected

@@ -3,10 +3,12 @@
 from importlib import import_module
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from rsundistort.errors import ReconstructionError
 from rsundistort.sfm.mapping import map_photos
+from rsundistort.solve.tracks import check_enough
 
 mapping = import_module("rsundistort.sfm.mapping")
 MATCHED = SimpleNamespace(names=[f"{k}.jpg" for k in range(16)])
@@ -52,3 +54,10 @@ def test_photos_that_no_attempt_registers_are_refused(attempts, registers):
     with pytest.raises(ReconstructionError, match="none of the 16 photos overlap enough to be registered"):
         map_photos(MATCHED)
     assert attempts[0] == [2048, 4096, None, "one by one"]
+
+
+@pytest.mark.parametrize(("apart", "says"), [(0.01, "show no parallax"), (1.0, "could be registered")])
+def test_photos_from_one_spot_are_told_so(apart, says):
+    before = SimpleNamespace(center_w=np.array([[0.0, 0, 0], [apart, 0, 0]]), size=5.0)
+    with pytest.raises(ReconstructionError, match=says):
+        check_enough(SimpleNamespace(num_images=0), 12, before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from rsundistort.bundle import BundleResult
 from rsundistort.bundle.own_motions import own_motions
 from rsundistort.bundle.path_prior import FramePath, PathStart
 from rsundistort.input.key_frames import Clip
+from rsundistort.solve import shaking
 from rsundistort.solve.shaking import held_by_slow_rotations, speeds_of, tell_if_held, with_slow_rotations
+from rsundistort.verdict.speeds import BySpeed, ReadoutTime
 
 NUM = 40
 
@@ -79,3 +82,13 @@ def test_a_path_that_follows_its_camera_is_free() -> None:
     # too few frames say nothing
     few = rec.take_photos(np.arange(NUM) < 20)
     assert held_by_slow_rotations(clip, few, path, own_motions(few)) is path
+
+
+@pytest.mark.parametrize(("size_px", "held"), [(0.05, False), (0.5, True)])
+def test_what_lens_and_scene_leave_is_no_shaking(monkeypatch, size_px, held):
+    f = 500.0
+    rec = SimpleNamespace(cameras=[SimpleNamespace(K=np.diag([f, f, 1.0]))])
+    said = BySpeed(ReadoutTime(0.02, 1e-3), None, 0.5, size_px / f)
+    monkeypatch.setattr(shaking, "speeds_of", lambda *_, **__: said)
+    path = FramePath({"a": 0.0, "b": 1 / 30}, 1 / 30)
+    assert bool(held_by_slow_rotations(None, rec, path, None).held_sigma) == held

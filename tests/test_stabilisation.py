@@ -184,3 +184,14 @@ def test_nothing_at_all_is_unknown_and_wrong_shapes_are_refused():
     ):
         with pytest.raises(InputError):
             judge_stabilisation(times, pairs, turns, phi, sigma, readout_s=readout_s)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_frames_that_jump_were_not_made_smooth(seed):
+    """A mount that vibrates at 40 to 90 Hz: frames do not show how it rotates while they are read."""
+    vibrating = motion(seed, 0.1, 0.05, 0.3) + motion(seed + 50, 1.0, 40, 90)
+    found = clip(seed, vibrating, vibrating, 0.02)
+    assert found.frames_jump
+    if found.shows_shaking:
+        assert found.reason.startswith("shakes faster than 15 Hz")
+    assert not clip(seed, motion(seed, 0.1, 0.05, 0.3), vibrating, 0.02).frames_jump

@@ -15,7 +15,14 @@ from rsundistort.bundle import BundleOptions, GuessedCameras, bundle_adjust
 from rsundistort.bundle.path_prior import FramePath
 from rsundistort.errors import ReconstructionError
 from rsundistort.solve import video_path
-from rsundistort.solve.video_path import _at_first, _is_other_lens, _travelled, _with_unknown_lens
+from rsundistort.solve.video_path import (
+    _at_first,
+    _is_other_lens,
+    _new_points,
+    _travelled,
+    _with_known_lens,
+    _with_unknown_lens,
+)
 
 FRAME_S = 1 / 30
 
@@ -110,3 +117,37 @@ def test_the_last_adjustment_is_repeated_while_it_moves_the_lens_but_not_forever
 
 def test_the_lens_of_a_camera_that_is_given_is_believed(clip_of):
     assert clip_of([(400.0, 0.5)], [350.0], calibrated=True) == ([], 350.0)
+
+
+@pytest.mark.parametrize(
+    ("focal_sigma", "varying_px", "steady_px", "varies"),
+    [(1e-4, 0.3, None, True), (0.01, 0.3, 0.3, False), (0.01, 0.3, 0.4, True)],
+)
+def test_a_lens_that_is_known_varies_only_if_that_explains_the_frames(
+    monkeypatch, focal_sigma, varying_px, steady_px, varies
+):
+    """Travel looks like zoom."""
+
+    def adjusted(_, model, options, __):
+        assert options.varying or steady_px is not None
+        sizes = (focal_sigma, varying_px) if options.varying else (0.0, steady_px)
+        return SimpleNamespace(focal_sigma=sizes[0], sigma_px=sizes[1])
+
+    monkeypatch.setattr(video_path, "bundle_adjust", adjusted)
+    found = _with_known_lens(None, _at_first(BundleOptions()), StageLog(None))
+    assert (found.focal_sigma > 0) == varies
+
+
+@pytest.mark.parametrize(("found", "asked"), [(500, [None]), (100, [None, 0.2]), (None, [None, 0.2])])
+def test_points_of_frames_close_together_may_meet_at_small_angles(monkeypatch, found, asked):
+    angles = []
+
+    def made(*_, least_deg=None):
+        angles.append(least_deg)
+        if found is None and least_deg is None:
+            raise ReconstructionError("no point")
+        return SimpleNamespace(num_points=1000 if least_deg else found)
+
+    monkeypatch.setattr(video_path, "retriangulate", made)
+    assert _new_points(None, SimpleNamespace(num_points=1000)).num_points == (1000 if len(asked) > 1 else found)
+    assert angles == asked
