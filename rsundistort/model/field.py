@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "add_field",
+    "excess_px",
     "field_basis",
     "field_over_frame",
     "field_slope",
@@ -36,6 +37,8 @@ __all__ = [
 _LOOKED_AT = 33
 # Slope of a field; from 1 on a photo may fold.
 _STEEPEST = 0.5
+# Largest field beside a lens model, root mean square over the frame: with more, it is not the model of this lens.
+_MOST_PX = 0.5
 
 
 def _splines(u: Array, count: int, slope: bool = False) -> Array:
@@ -118,6 +121,12 @@ def add_field(camera: Camera, x: NDArray[np.floating], y: NDArray[np.floating]) 
     """Take a map, x and y (rows, cols), from pixels of the lens model to those of the photo, in place."""
     if camera.field.size:
         kernels.add_field(camera.spline, camera.width, camera.height, x, y)
+
+
+def excess_px(camera: Camera) -> float:
+    """Root mean square of a camera's field over its frame, if no lens of its kind deviates by so much; else 0."""
+    size_px = float(np.sqrt((field_over_frame(camera)[1] ** 2).sum(2).mean()))
+    return size_px if size_px > _MOST_PX else 0.0
 
 
 def field_over_frame(camera: Camera, across: int = 33, down: int = 25) -> tuple[Array, Array]:

@@ -34,6 +34,7 @@ from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
 from ..model import Camera, Reconstruction
+from ..model.field import excess_px
 from ..sfm import read_num_verified
 from ..verdict import Verdict, judge
 from .outcome import Solved
@@ -361,7 +362,7 @@ def _lens_instead(
     cameras, unexplained = found.reconstruction.cameras, choice.unexplained_px(found.sigma_px) > 0
     if choice.shutter == "found":
         return cameras, ""
-    if guessed is not None and unexplained and guessed.surprises(cameras):
+    if guessed is not None and unexplained and (guessed.surprises(cameras) or any(map(excess_px, cameras))):
         # things that move, or photos that are misplaced: what no lens explains says nothing about the lens
         assumed = [replace(guess, readout=each.readout) for each, guess in zip(cameras, guessed.cameras, strict=True)]
         return assumed, (

@@ -16,7 +16,7 @@ from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
-from ..model.field import field_over_frame
+from ..model.field import excess_px
 from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, hidden_px, photo_motions
 from .residuals import left_along_readout, left_over_frame
@@ -33,8 +33,6 @@ _SMALL_PERCENT = 0.5
 # Largest residual in the same places of all photos. A lens that makes motions wrong by half a pixel leaves 0.1 to 0.15
 # even where cameras are rotated freely (k1 wrong by 0.03), and less where they are not.
 _LEFT_PX = 0.1
-# Largest residual field beside a lens model: with more, it is not the model of this lens.
-_FIELD_PX = 0.5
 # Standard deviations that the motion of some photo must exceed, root mean square over the frame: errors alone do so in
 # one photo of 20 if one component decides, in one of 140 if all three do.
 _EVIDENT = 2.0
@@ -239,8 +237,7 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
             f"At the same times of the readout {left:.2f} px remain unexplained: the model of the lens, or of the "
             "motion during the readout, does not fit."
         )
-    fields = [field_over_frame(camera)[1] for camera in result.reconstruction.cameras]
-    if (size := max(float(np.sqrt((field**2).sum(2).mean())) for field in fields)) > _FIELD_PX:
+    if (size := max(map(excess_px, result.reconstruction.cameras))) > 0:
         reasons.append(
             f"The photos deviate from the lens model by {size:.1f} px in the mean, more than any lens of its kind: it "
             "is not the model of this lens."
