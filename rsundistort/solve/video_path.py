@@ -178,7 +178,7 @@ def _filmed_by(
 
     try:
         found = _travelled(clip, path, options_of, log, telemetry, read_so)
-    except ReconstructionError:
+    except (InputError, ReconstructionError):
         # no scene: rotations that explain neighbours are all that there is
         if rotated is None:
             raise
