@@ -44,6 +44,8 @@ __all__ = ["frame_path", "solve_clip"]
 _LEAST_MEASUREMENTS = 15
 # Rotations explain the frames up to this error of the flow in pixels, and this share of outliers.
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
+# Error that the flow has itself, where nothing else is left.
+_EXACT_PX = 0.125
 # Times that error after a first adjustment, which knows neither the rotations' size nor the readout.
 _AT_FIRST = 4.0
 # Times that frames which only rotate are adjusted again, since some are missing between them.
@@ -212,8 +214,8 @@ def _only_rotated(
 ) -> tuple[FoundPath | None, str]:  # fmt: skip
     """The path of a camera that only rotates, if that explains neighbours; and by what it explains all frames.
 
-    "by rotations" of one lens, or "by zooming", too: by a focal length that varies, which takes travel for zoom; "" if
-    by neither.
+    "by rotations", of a lens that may focus if that leaves no more than the flow's own error; or "by zooming" only: by
+    a focal length that varies, which takes travel for zoom; "" if by neither.
     """
     log.begin("rotations")
     start, found, explained = rotating_only(clip, keys), None, ""
@@ -228,10 +230,12 @@ def _only_rotated(
             if other is None:
                 continue
             dropped = 1 - len(other.result.reconstruction.observations) / len(start.observations)
-            if other.result.sigma_px < _FLOW_PX and dropped < _OUTLIERS:
-                found, explained = other, how
+            explains = other.result.sigma_px < _FLOW_PX and dropped < _OUTLIERS
+            if explains and other.result.sigma_px < _EXACT_PX:
+                found, explained = other, "by rotations"
                 break
-            found = found or other
+            if found is None or (explains and not explained):
+                found, explained = other, how if explains else ""
     log.end("rotations", explained=explained)
     return found, explained
 
