@@ -169,3 +169,18 @@ def test_such_a_photo_is_named(doubted):
     np.testing.assert_allclose(raw, still, atol=1e-6)
     raw, still = displacement_field(solution, solution.image("0002.jpg"))
     assert np.linalg.norm(raw - still, axis=1).max() > 10
+
+
+def test_frames_of_a_tripod_that_need_no_correction_have_no_shape():
+    images = tuple(
+        SolvedImage(f"{k}.png", "1", np.eye(3), np.zeros(3), motion=RowMotion(), rs_shift_px=0.1) for k in range(3)
+    )
+    time = {"seconds": 0.02, "sigma": 0.006, "source": "the video", "of_frame": 0.6}
+    found = Verdict("not-found", "trusted").to_json()
+    solution = Solution(
+        "constant-motion", {"1": CAMERA}, {"1": CAMERA.pinhole()}, images, verdict=found,
+        quality={"readout_time": time},
+    )  # fmt: skip
+    text = verdict_of(solution).sentences[2]
+    assert "the camera only rotated, so that there is no scene" in text
+    assert "as good as" not in text

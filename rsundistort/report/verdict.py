@@ -158,7 +158,10 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
         return "care", "The shutter was not examined", text
     if trusted and shutter == "not-found":
         reason = _unneeded(solution, largest) or "no shutter can be seen"
-        text = f"No correction is needed: {reason}, and the shape of the scene is as good as that of a global shutter."
+        shape = "the shape of the scene is as good as that of a global shutter"
+        if _only_rotated(solution):
+            shape = "the camera only rotated, so that there is no scene"
+        text = f"No correction is needed: {reason}, and {shape}."
         return "still", "No correction needed", text + _unseen(solution)
     level, sentence = _height(solution)
     if trusted and _only_rotated(solution):
