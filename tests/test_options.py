@@ -148,7 +148,10 @@ OTHERS = [
             (["--vibration", "2", "--vibration-axis", "x"], {"vibration": Vibration(2e-3, axis="x")}),
             (["--gyro", "log.csv"], {"gyro": GyroLog([0, 1], [[1, 2, 3]] * 2)}),
             (["--gyro", "log.csv", "--gyro-axes", "YZX"], {"gyro": GyroLog([0, 1], [[2, 3, 1]] * 2)}),
-            (["--readout-ms", "20"], {"readout_s": 0.02}),
+            (
+                ["--gyro", "log.csv", "--readout-ms", "20"],
+                {"gyro": GyroLog([0, 1], [[1, 2, 3]] * 2), "readout_s": 0.02},
+            ),
             (["--still", "a.jpg", "--still", "b.jpg"], {"still": ("a.jpg", "b.jpg")}),
             (["--crop"], {"crop": True}),
             (["--quality", "80"], {"quality": 80}),
@@ -285,7 +288,7 @@ def test_options_of_other_commands_set_their_fields(
     untried = {each.name for each in named if not flags & {*each.opts, *each.secondary_opts}}
     assert untried <= NOT_OPTIONS
     for option in named:
-        kept = [getattr(options, field) for arguments, (field,) in tried if arguments[0] in option.opts]
+        kept = [getattr(options, next(iter(fields))) for arguments, fields in tried if arguments[0] in option.opts]
         shown = option.to_info_dict()["default"]
         if shown is not None and kept and option.name != "motion":  # which has a name of its own for two fields
             assert shown == kept[0]

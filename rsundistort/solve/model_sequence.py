@@ -359,21 +359,26 @@ def _lens_instead(
     choice: ModelChoice, found: BundleResult, start: Reconstruction, guessed: GuessedCameras | None
 ) -> tuple[Sequence[Camera], str]:
     """A lens in place of one that was found without a shutter and is none; and why, "" if it is one."""
-    cameras, unexplained = found.reconstruction.cameras, choice.unexplained_px(found.sigma_px) > 0
+    cameras, other = found.reconstruction.cameras, start.cameras
     if choice.shutter == "found":
         return cameras, ""
-    if guessed is not None and unexplained and (guessed.surprises(cameras) or any(map(excess_px, cameras))):
-        # things that move, or photos that are misplaced: what no lens explains says nothing about the lens
+    # things that move, or photos that are misplaced: what neither lens nor shutter explains says nothing about a lens
+    is_odd, is_other_odd = (
+        guessed is not None
+        and choice.unexplained_px(found.sigma_px) > 0
+        and bool(guessed.surprises(each) or any(map(excess_px, each)))
+        for each in (cameras, other)
+    )
+    moved = _is_no_lens(cameras, other)
+    if guessed is not None and is_odd and (is_other_odd or not moved):
         assumed = [replace(guess, readout=each.readout) for each, guess in zip(cameras, guessed.cameras, strict=True)]
         return assumed, (
             "the photos contradict each other, and would need a lens that is not the camera's: they are corrected for "
             "the lens that was assumed before"
         )
-    # nor does what no shutter explains say anything about the lens
-    has_other = guessed is None or not (unexplained and guessed.surprises(start.cameras))
-    if has_other and _is_no_lens(cameras, start.cameras):
+    if moved and not is_other_odd:
         # it makes up for a shutter; that of the model which has one does not
-        return start.cameras, (
+        return other, (
             "without a shutter the photos would need a lens whose principal point lies far from that of any lens: they "
             "are corrected for the lens that the model with a shutter found"
         )
