@@ -22,6 +22,7 @@ from rsundistort import (
     critical_motion,
 )
 from rsundistort.batch.progress import StageLog
+from rsundistort.bundle import measured_lengths
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.critical import advise, heal, shape_cost, still_probability, with_remedy
@@ -397,6 +398,15 @@ def test_lengths_without_two_points_are_left_out_and_named(what, rng):
         found = bundle_adjust(truth, "rotation", BundleOptions(lengths=lengths, loss="huber")).reconstruction
     without = bundle_adjust(truth, "rotation", BundleOptions(lengths=good, loss="huber")).reconstruction
     np.testing.assert_allclose(found.center_w, without.center_w, atol=1e-4)
+
+
+def test_a_length_that_is_left_alone_is_not_used_and_named(rng):
+    truth = with_measurements(named_scene("random"), np.zeros((10, 3)), "rotation")
+    good = KnownLength(seen_at(truth, 0), seen_at(truth, 1), 1.0, 0.1)
+    kept, lost = measured_lengths(truth, [good, KnownLength(seen_at(truth, 2), ("00.jpg", 5000.0, 0.0), 1.0, 0.1)])
+    assert kept == ()
+    assert "no point is measured" in lost[0]
+    assert "only one left" in lost[1]
 
 
 def test_lengths_of_photos_that_are_not_registered_are_left_out_and_named(rng):

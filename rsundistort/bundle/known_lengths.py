@@ -40,6 +40,8 @@ def measured_lengths(
             lost.append(f"{each.start} and {each.end} are the same point of the scene")
         elif not far:
             kept.append(each)
+    if len(kept) == 1:
+        lost.append("it is the only one left, and ratios need two")
     return tuple(kept if len(kept) > 1 else ()), lost
 
 
