@@ -143,10 +143,8 @@ def detect_features(
     gray = reduced.gray
     # descriptors that are not kept cost more than a second pyramid, except where few are left out
     at_once = gray.size < _PIXELS_PER_FEATURE * max_features
-    sift, raw = _sift(1.0), None
-    keypoints = () if at_once else sift.detect(gray, reduced.mask)
-    if at_once:
-        keypoints, raw = sift.detectAndCompute(gray, reduced.mask)
+    sift = _sift(1.0)
+    keypoints, raw = sift.detectAndCompute(gray, reduced.mask) if at_once else (sift.detect(gray, reduced.mask), None)
     shown = gray.size if reduced.mask is None else np.count_nonzero(reduced.mask)
     if _FEW_FEATURES * len(keypoints) < shown:
         range_of = np.diff(np.percentile(gray, _CONTRAST))[0] / 255
