@@ -29,7 +29,7 @@ from rsundistort import (
     rectify,
     unproject_points,
 )
-from rsundistort.bundle import BundleResult, Posterior, gauge_directions
+from rsundistort.bundle import BundleResult, Posterior
 from rsundistort.bundle.intrinsics import DECENTRING, moved_camera
 from rsundistort.bundle.triangulate import _world_rays
 from rsundistort.critical import Remedy, shape_cost
@@ -48,7 +48,9 @@ Array = np.ndarray
 def normalised_errors(
     solution: Solution, truth: Solution, sigmas: Mapping[str, Any] | None = None, log_k: float | None = None
 ) -> dict[str, Array | None]:
-    """Errors of phi (m, 3), mean_phi (3,), log_k () and center (m, 3) over their deviations; None where one is missing.
+    """Errors over their deviations, of what has both; None of the rest.
+
+    Of phi, rotation and center (m, 3), mean_phi (3,) and log_k ().
 
     Parameters
     ----------
@@ -56,20 +58,31 @@ def normalised_errors(
         The truth has motions and poses of all photos that are registered; the centres are aligned by the best
         similarity.
     sigmas : mapping of quantity to array, optional
-        Standard deviations, before those that the solution has: of phi and mean_phi in radians per frame, of center in
-        the solution's frame and after that similarity, of log_k as `log_k_error` says.
+        Standard deviations, before those that the solution has: of mean_phi in radians per frame, of log_k as
+        `log_k_error` says.
     log_k : float, optional
         Its error.
     """
     registered = solution.registered
     span = np.array([[solution.cameras[image.camera_id].frame_span] for image in registered])
-    own = [image.sigma_phi for image in registered]
-    known: dict[str, Any] = {"phi": None if any(each is None for each in own) else span * np.array(own)}
+    known: dict[str, Any] = {}
+    for key, per_frame in (("phi", span), ("rotation", 1.0), ("center", 1.0)):
+        own = [getattr(image, f"sigma_{key}") for image in registered]
+        known[key] = None if any(each is None for each in own) else per_frame * np.array(own)
     known |= {"log_k": (solution.critical_motion or {}).get("sigma_log_k"), **(sigmas or {})}
     phi = motion_errors(solution, truth).phi_rad_per_frame
     centers, true = (np.array([each.image(image.name).center_w for image in registered]) for each in (solution, truth))
     scale, R, shift = align_points(true, centers)
-    errors = {"phi": phi, "mean_phi": phi.mean(0), "log_k": log_k, "center": centers - scale * true @ R.T - shift}
+    R_cw, true_R_cw = (np.array([each.image(image.name).R_cw for image in registered]) for each in (solution, truth))
+    # of the world that fits all orientations best
+    turn = Rotation.from_matrix(np.einsum("mji,mjk->ik", R_cw, true_R_cw) / len(R_cw)).as_matrix()
+    errors = {
+        "phi": phi,
+        "mean_phi": phi.mean(0),
+        "log_k": log_k,
+        "rotation": Rotation.from_matrix(R_cw @ turn @ true_R_cw.transpose(0, 2, 1)).as_rotvec(),
+        "center": centers - scale * true @ R.T - shift,
+    }
     return {
         key: None if error is None or known.get(key) is None else np.asarray(error / known[key])
         for key, error in errors.items()
@@ -96,7 +109,7 @@ def alike(errors: Sequence[Mapping[str, Array | None]]) -> dict[str, float]:
     that one of them lacks, or whose photos are not those of the others, are left out.
     """
     found = {}
-    for key in ("phi", "center"):
+    for key in ("phi", "rotation", "center"):
         values = [np.ravel(value) for each in errors if (value := each[key]) is not None]
         if len(values) == len(errors) > 1 and len({len(value) for value in values}) == 1:
             apart = np.triu_indices(len(values), 1)
@@ -173,14 +186,7 @@ def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleO
     mean = np.zeros((3, m, nb))
     mean[:, :, 6:9] = np.eye(3)[:, None] * rec.frame_span()[:, None] / m
     variance = (mean * posterior.of_photos(mean)).sum((1, 2))
-    each = np.zeros((3 * m, m, nb))
-    each[:, :, 3:6] = np.eye(3 * m).reshape(3 * m, m, 3)
-    covariance = posterior.of_photos(each)[:, :, 3:6].reshape(3 * m, 3 * m)
-    # the best similarity takes off what moves, rotates or scales all centres together
-    moves = np.linalg.qr(gauge_directions(result)[:, :, 3:6].reshape(7, -1).T)[0]
-    free = np.eye(3 * m) - moves @ moves.T
-    center = np.sqrt(np.diag(free @ covariance @ free)).reshape(m, 3)
-    return {"mean_phi": np.sqrt(variance), "center": center[np.argsort(rec.image_names)]}
+    return {"mean_phi": np.sqrt(variance)}
 
 
 def _meeting_points(rec: Reconstruction) -> tuple[Array, Array]:

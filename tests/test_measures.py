@@ -10,6 +10,7 @@ from measures import alike, from_elsewhere, library_sigmas, log_k_error, normali
 from solved_scene import SCENES
 
 from rsundistort import BundleOptions, Observations, Reconstruction, Solution, SolvedImage, bundle_adjust, read_solution
+from rsundistort.bundle import pose_covariances
 from rsundistort.critical import heal
 
 
@@ -20,19 +21,28 @@ def test_errors_of_measurements_with_known_noise_are_one_deviation(rng):
     with np.load(scene / "tracks.npz") as tracks:
         names = [str(name) for name in tracks["image_names"]]
         frame, point, xy = tracks["frame_idx"], tracks["point_idx"], tracks["xy_raw"]
-        poses = tracks["R_cw"], tracks["center_w"], tracks["points_w"]
+        start_at = tracks["R_cw"], tracks["center_w"], tracks["points_w"]
     phi = np.array([truth.image(name).motion.phi for name in names])
     errors = []
     for _ in range(8):
         seen = Observations(frame, point, xy + rng.normal(0, 0.3, xy.shape))
         start = Reconstruction(
-            [camera], names, np.zeros(len(names), int), *poses, seen, phi, shutter_model="rotation"
+            [camera], names, np.zeros(len(names), int), *start_at, seen, phi, shutter_model="rotation"
         )  # fmt: skip
         options = BundleOptions()
         result, remedy = heal(bundle_adjust(start, "rotation", options), options)
-        rec = result.reconstruction
+        rec, poses = result.reconstruction, pose_covariances(result, remedy.added_to(options))
         images = [
-            SolvedImage(name, "1", rec.R_cw[i], rec.center_w[i], rec.motion(i), result.sigma_phi[i])
+            SolvedImage(
+                name,
+                "1",
+                rec.R_cw[i],
+                rec.center_w[i],
+                rec.motion(i),
+                result.sigma_phi[i],
+                sigma_rotation=poses.sigma_rotation[i],
+                sigma_center=poses.sigma_center(rec.R_cw, rec.baseline)[i],
+            )
             for i, name in enumerate(names)
         ]
         critical = {"sigma_log_k": remedy.after.sigma_log_k}
@@ -47,12 +57,12 @@ def test_errors_of_measurements_with_known_noise_are_one_deviation(rng):
 def test_what_has_no_deviation_is_missing():
     truth = read_solution(SCENES / "courtyard" / "ground_truth.json")
     found = normalised_errors(truth, truth, {"mean_phi": np.ones(3)}, log_k=0.0)
-    assert pooled([found]) == {"phi": None, "mean_phi": 0.0, "log_k": None, "center": None}
+    assert pooled([found]) == dict.fromkeys(("phi", "mean_phi", "log_k", "rotation", "center")) | {"mean_phi": 0.0}
 
 
 def test_sets_that_err_as_one_are_alike(rng):
     phi, center = rng.normal(size=(2, 5, 3))
-    one = {"phi": phi, "mean_phi": phi.mean(0), "log_k": None, "center": None}
+    one = {"phi": phi, "mean_phi": phi.mean(0), "log_k": None, "rotation": None, "center": None}
     assert alike([one, one | {"phi": -2 * phi}]) == {"phi": -1.0}
     assert alike([one | {"center": center}] * 3) == {"phi": 1.0, "center": 1.0}
     assert alike([one]) == {}

@@ -13,6 +13,7 @@ from .known_lengths import measured_lengths, scale_of_lengths
 from .known_motions import FAR, KnownMotions, judge_known_motions, misses_of
 from .known_positions import KnownPlaces
 from .model_choice import ModelChoice
+from .pose_sigmas import PoseCovariances, pose_covariances
 from .posterior import Posterior, gauge_directions
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "KnownPlaces",
     "ModelChoice",
     "PlacedControl",
+    "PoseCovariances",
     "Posterior",
     "ReadoutChoice",
     "adjust_sequence",
@@ -40,6 +42,7 @@ __all__ = [
     "objective",
     "pixels_of",
     "place_control",
+    "pose_covariances",
     "scale_of_lengths",
     "sequence_to",
     "with_control",

@@ -38,7 +38,7 @@ _IMAGE = {
     "phi?": Maybe(Numbers(3)),
     "velocity?": Maybe(Numbers(3)),
     "bend?": Maybe({"clock": Numbers(None), "rotation": Numbers(None, 3), "position?": Maybe(Numbers(None, 3))}),
-    "sigma_phi?": Maybe((_NUMBER, _NUMBER, _NUMBER)),
+    **{f"sigma_{name}?": Maybe((_NUMBER, _NUMBER, _NUMBER)) for name in ("phi", "rotation", "center")},
     "num_observations?": Maybe(Between(0, 2**53)),
     "rms_px?": _AMOUNT,
     "rs_shift_px?": _AMOUNT,
@@ -142,6 +142,8 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
             "aspect": None,
             "skew": None,
             "sigma_phi": image.sigma_phi,
+            "sigma_rotation": image.sigma_rotation,
+            "sigma_center": image.sigma_center,
             "num_observations": image.num_observations,
             "rms_px": image.rms_px,
             "rs_shift_px": image.rs_shift_px,
@@ -270,11 +272,12 @@ def _image_from_json(entry: dict[str, Any], where: str) -> SolvedImage:
         if entry["registered"] and entry.get("phi") is not None:
             velocity = entry.get("velocity") or [0.0, 0.0, 0.0]
             motion = RowMotion(np.array(entry["phi"], float), np.array(velocity, float), _bend_from_json(entry))
-        roi, sigma = entry.get("roi"), entry.get("sigma_phi")
+        roi = entry.get("roi")
         same: dict[str, Any] = {name: entry.get(name) for name in _AS_THEY_ARE}
+        for name in ("sigma_phi", "sigma_rotation", "sigma_center"):  # what is not known is NaN
+            same[name] = None if entry.get(name) is None else np.array(entry[name], float)
         return SolvedImage(
             motion=motion,
-            sigma_phi=None if sigma is None else np.array(sigma, float),
             num_observations=entry.get("num_observations") or 0,
             applied_orientation=entry.get("turned", 1),
             roi=None if roi is None else (roi[0], roi[1], roi[2], roi[3]),

@@ -145,12 +145,16 @@ def orient_image(image: SolvedImage, orientation: int, camera_id: str) -> Solved
         # phi is an axial vector: a mirror reverses it
         bend = None if motion.bend is None else motion.bend.rotated(hand * matrix)
         motion = replace(motion, phi=hand * matrix @ motion.phi, bend=bend)
+    sigma_phi, sigma_rotation = (
+        None if sigma is None else np.abs(matrix) @ sigma for sigma in (image.sigma_phi, image.sigma_rotation)
+    )
     return replace(
         image,
         camera_id=camera_id,
         R_cw=None if image.R_cw is None else matrix @ image.R_cw,
         motion=motion,
-        sigma_phi=None if image.sigma_phi is None else np.abs(matrix) @ image.sigma_phi,
+        sigma_phi=sigma_phi,
+        sigma_rotation=sigma_rotation,
         applied_orientation=compose_orientations(image.applied_orientation, orientation),
     )
 

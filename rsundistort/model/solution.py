@@ -57,6 +57,12 @@ class SolvedImage(ComparedByFields):
     lens_only : bool
         Whether the rectified photo has the lens taken out only, since the measurements do not support the motion that
         was found: `motion` stays what was found, `taken_out` is none.
+    sigma_rotation : (3,) array or None
+        Standard deviations of the rotation about the axes of the camera, radians, if known: after the common rotation
+        that fits the true ones of all photos best.
+    sigma_center : (3,) array or None
+        Standard deviations of the centre along the axes of the world, in its units, if known: after the similarity that
+        fits the true ones of all photos best. Of a georeferenced solution both are those on the map.
     """
 
     name: str
@@ -75,6 +81,8 @@ class SolvedImage(ComparedByFields):
     roi: tuple[int, int, int, int] | None = None
     doubtful: str | None = None
     lens_only: bool = False
+    sigma_rotation: Array | None = None
+    sigma_center: Array | None = None
 
     def __post_init__(self) -> None:
         check_photo_name(self.name)
@@ -86,9 +94,9 @@ class SolvedImage(ComparedByFields):
         if self.center_w is not None:
             center = check_finite(self.center_w, (3,), f"center_w of {self.name}")
             object.__setattr__(self, "center_w", frozen(center))
-        if self.sigma_phi is not None:
-            sigma = check_array(self.sigma_phi, (3,), f"sigma_phi of {self.name}")
-            object.__setattr__(self, "sigma_phi", frozen(sigma))
+        for name in ("sigma_phi", "sigma_rotation", "sigma_center"):
+            if (sigma := getattr(self, name)) is not None:
+                object.__setattr__(self, name, frozen(check_array(sigma, (3,), f"{name} of {self.name}")))
 
     @property
     def registered(self) -> bool:

@@ -77,6 +77,13 @@ def photos(source: Source) -> list[dict[str, Any]]:
     return rows
 
 
+def pose_sigma_deg(solution: Solution) -> float | None:
+    """Median over the photos of the standard deviation of their rotations, degrees; None where it is not known."""
+    sigmas = [image.sigma_rotation for image in solution.registered if image.sigma_rotation is not None]
+    median = float(np.median(np.linalg.norm(sigmas, axis=1))) if sigmas else np.nan
+    return float(np.degrees(median)) if np.isfinite(median) else None
+
+
 def motions(solution: Solution) -> list[dict[str, Any]]:
     """Rotation over the readout of photos that did not rotate steadily: SVG paths for the three axes.
 

@@ -102,6 +102,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         quality={**_QUALITY, **solution.quality},
         critical={**_CRITICAL, **solution.critical_motion} if solution.critical_motion else {},
         advice=advice_of(solution),
+        pose_sigma_deg=content.pose_sigma_deg(solution),
         notes=source.notes,
         photos=content.photos(source),
         motions=content.motions(solution),

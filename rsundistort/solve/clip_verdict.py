@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..batch.progress import StageLog
-from ..bundle import BundleOptions, BundleResult, bundle_adjust
+from ..bundle import BundleOptions, BundleResult, bundle_adjust, pose_covariances
 from ..bundle.own_motions import own_motions
 from ..bundle.path_prior import FramePath
 from ..critical import heal
@@ -102,7 +102,8 @@ def judged(
     result, stabilisation = tested.result, tested.stabilisation
     if stabilisation.verdict != "stabilised":
         tell_if_held(found.path)
-    of_keys = result.of_photos(clip.are_keys(result.reconstruction.image_names))
+    are_keys = clip.are_keys(result.reconstruction.image_names)
+    of_keys, poses = result.of_photos(are_keys), pose_covariances(result, found.options)
     log.begin("comparison with a global shutter")
     global_result = _read_at_once(found, result, of_keys)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
@@ -125,12 +126,14 @@ def judged(
     rec, whole, on_path = of_keys.reconstruction, result.reconstruction, result.path
     assert on_path is not None
     world = rec.R_cw[0], rec.center_w[0], 1.0 / rec.baseline
+    if poses is not None:
+        poses = poses.take(are_keys, rec.baseline / whole.baseline)
     if at_once:
         rec, whole = _standing(rec), _standing(whole)
     path = replace(on_path, path=on_path.path.moved(*world))
     return Solved(
         replace(of_keys, reconstruction=rec.moved(*world), path=path), global_result, keys.cameras, remedy=remedy,
-        verdict=verdict, whole=whole.moved(*world), evidence=_evidence(found, tested, alone, at_once),
+        verdict=verdict, whole=whole.moved(*world), evidence=_evidence(found, tested, alone, at_once), poses=poses,
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from ..bundle import (
     choose_model,
     choose_readouts,
     judge_known_motions,
+    pose_covariances,
 )
 from ..bundle.doubt import steps_after
 from ..critical import Advice, Remedy, advise, heal, with_remedy
@@ -199,9 +200,7 @@ def solve_tracks(
     if survey is not None and survey.holding:
         survey, result, options = _with_control(survey, result, options, log)
     result, mended, advice = _healed(result, options, remedy, log)
-    log.begin("comparison with a global shutter")
-    global_result = without_shutter(result, options)
-    log.end("comparison with a global shutter", rms_px=global_result.rms_px)
+    global_result = _compared(result, options, log)
     log.begin("verdict")
     measured = mapped if track_source is None else tracks
     suspects = [] if registrar is None else registrar.suspects(result.reconstruction)
@@ -209,9 +208,11 @@ def solve_tracks(
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
+    poses = pose_covariances(result, options if mended is None else mended.added_to(options))
     solved = Solved(
-        result, global_result, cameras, choice, mended, advice, directions, verdict, known_motions=known_motions
-    )
+        result, global_result, cameras, choice, mended, advice, directions, verdict, known_motions=known_motions,
+        poses=poses,
+    )  # fmt: skip
     return solved if survey is None else _on_the_map(solved, survey, options)
 
 
@@ -257,6 +258,14 @@ def _healed(
     advice = advise(result, mended.added_to(options)) if is_critical else []
     log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     return result, mended, advice
+
+
+def _compared(result: BundleResult, options: BundleOptions, log: StageLog) -> BundleResult:
+    """The stage that compares the solution with one of a global shutter."""
+    log.begin("comparison with a global shutter")
+    plain = without_shutter(result, options)
+    log.end("comparison with a global shutter", rms_px=plain.rms_px)
+    return plain
 
 
 def _known_motions(result: BundleResult, model: str, options: BundleOptions, seed: int) -> KnownMotions | None:

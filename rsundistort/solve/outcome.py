@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..batch.rectify_options import RectifyOptions
-from ..bundle import BundleResult, KnownMotions, ModelChoice, ReadoutChoice
+from ..bundle import BundleResult, KnownMotions, ModelChoice, PoseCovariances, ReadoutChoice
 from ..critical import Advice, Remedy
 from ..input.photo_cameras import PhotoCameras
 from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
@@ -62,6 +62,8 @@ class Solved:
         Further options in `solution.json`.
     known_motions : KnownMotions or None
         What the photos say of motions that are known from elsewhere; those that they contradict were left out.
+    poses : PoseCovariances or None
+        Of the photos' poses.
     """
 
     result: BundleResult
@@ -82,6 +84,7 @@ class Solved:
     survey: Survey | None = None
     georeference: Mapping[str, Any] | None = None
     known_motions: KnownMotions | None = None
+    poses: PoseCovariances | None = None
 
     @property
     def shared(self) -> Reconstruction:
@@ -247,6 +250,9 @@ def _images(solved: Solved) -> Iterator[SolvedImage]:
     rms = _image_rms(rec)
     counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
     places = {name: i for i, name in enumerate(rec.image_names)}
+    poses, none = solved.poses, [None] * rec.num_images
+    sigma_rotation = none if poses is None else poses.sigma_rotation
+    sigma_center = none if poses is None else poses.sigma_center(rec.R_cw, rec.baseline)
     for name in sorted([*rec.image_names, *solved.unregistered]):
         if name in solved.unregistered:
             yield SolvedImage(name, str(solved.camera_id_of(name)), reason=solved.unregistered[name])
@@ -260,6 +266,8 @@ def _images(solved: Solved) -> Iterator[SolvedImage]:
             center_w=rec.center_w[i],
             motion=rec.motion(i),
             sigma_phi=None if rec.shutter_model == "global" else solved.result.sigma_phi[i],
+            sigma_rotation=sigma_rotation[i],
+            sigma_center=sigma_center[i],
             num_observations=int(counts[i]),
             rms_px=float(rms[i]),
             rs_shift_px=shift_px,
