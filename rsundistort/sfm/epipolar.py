@@ -22,6 +22,7 @@ __all__ = [
     "Matches",
     "agreeing_photos",
     "distance_from_planes",
+    "matches_that_fit",
     "photo_pairs",
     "read_matches",
     "read_num_verified",
@@ -138,6 +139,17 @@ def read_matches(matched: MatchedPhotos) -> Matches:
     with quiet_pycolmap().Database.open(matched.database) as db:
         pairs = photo_pairs(db.read_all_matches()[0])
         return {(i, j): np.asarray(db.read_matches(i + 1, j + 1), np.int64) for i, j in pairs}
+
+
+def matches_that_fit(matched: MatchedPhotos, reconstruction: Reconstruction) -> Matches:
+    """The matches of a database that fit poses, of pairs where these are not too few."""
+    freed, found = FreedMatches(matched, reconstruction), Matches()
+    for pair, matches in read_matches(matched).items():
+        if (freed.posed[list(pair)] >= 0).all():
+            fitting = matches[freed.explained(*pair, matches)]
+            if len(fitting) >= MIN_EXPLAINED:
+                found[pair] = fitting
+    return found
 
 
 def read_verified(matched: MatchedPhotos) -> Matches:

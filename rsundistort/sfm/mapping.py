@@ -16,6 +16,7 @@ from ..errors import ReconstructionError
 from ..model import Reconstruction
 from .connected import LEAST_MEASUREMENTS
 from .database import LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, write_photos
+from .epipolar import Matches, matches_that_fit
 
 __all__ = ["PLACING_KEYPOINTS", "map_photos"]
 
@@ -38,15 +39,20 @@ _MAPPING_KEYPOINTS = 4096
 _LARGE = 60
 
 
-def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -> Path:
-    """A database of the largest keypoints (all: None) and the verified matches among them."""
+def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None, rough: Reconstruction | None) -> Path:
+    """A database of the largest keypoints (all: None) and the verified matches among them, or those that fit poses."""
     pycolmap = quiet_pycolmap()
     path = folder / "mapping.db"
+    fitting = Matches() if rough is None else matches_that_fit(matched, rough)
     with pycolmap.Database.open(matched.database) as db, pycolmap.Database.open(path) as small:
         write_photos(small, matched, limit)
         for pair_id in sorted(db.read_two_view_geometry_num_inliers()[0]):
             i, j = pycolmap.pair_id_to_image_pair(pair_id)
             pair = db.read_two_view_geometry(i, j)
+            if (i - 1, j - 1) in fitting:
+                pair = pycolmap.TwoViewGeometry()
+                pair.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                pair.inlier_matches = fitting[i - 1, j - 1].astype(np.uint32)
             matches = np.asarray(pair.inlier_matches)
             if limit is not None and len(matches):
                 pair.inlier_matches = matches[(matches < limit).all(1)]
@@ -59,6 +65,7 @@ def map_photos(
     progress: Callable[[int], None] | None = None,
     keypoints: Sequence[int | None] = PLACING_KEYPOINTS,
     shown: MatchedPhotos | None = None,
+    rough: Reconstruction | None = None,
 ) -> Reconstruction:
     """Global-shutter reconstruction with room for shutter distortion.
 
@@ -73,6 +80,9 @@ def map_photos(
         How many of the largest keypoints of each place it, in attempts one after the other; None for all.
     shown : MatchedPhotos, optional
         The photos as they are, where the keypoints of `matched` are not: their pixels are the measurements.
+    rough : Reconstruction, optional
+        Poses that place the photos roughly: of pairs of its photos the matches count that fit these, where there are
+        any, instead of those that an epipolar geometry with room for a shutter fits.
 
     Raises
     ------
@@ -83,12 +93,12 @@ def map_photos(
     enough = _ENOUGH_REGISTERED * total
     found, count = None, 0
     for limit in keypoints:
-        found = _with_more(found, _mapped_at_once(matched, limit, shown))
+        found = _with_more(found, _mapped_at_once(matched, limit, shown, rough))
         before, count = count, 0 if found is None else found.num_images
         if count == total or enough <= count == before:
             break
     if found is None or count < enough:
-        found = _with_more(found, _mapped_one_by_one(matched, progress, shown))
+        found = _with_more(found, _mapped_one_by_one(matched, progress, shown, rough))
     if found is None or found.num_images < 2:
         raise ReconstructionError(
             f"none of the {len(matched.names)} photos overlap enough to be registered; "
@@ -104,17 +114,20 @@ def _with_more(best: Reconstruction | None, other: Reconstruction | None) -> Rec
     return other if other.num_images > best.num_images else best
 
 
-def _mapped_at_once(matched: MatchedPhotos, limit: int | None, shown: MatchedPhotos | None) -> Reconstruction | None:
+def _mapped_at_once(
+    matched: MatchedPhotos, limit: int | None, shown: MatchedPhotos | None, rough: Reconstruction | None
+) -> Reconstruction | None:
     """What the global mapper registers by the largest keypoints, without photos that hang on by few measurements."""
     work = Path(mkdtemp(prefix="mapping-", dir=matched.database.parent))
     options = _global_options(matched)
-    models = quiet_pycolmap().global_mapping(_mapping_database(matched, work, limit), work, work, options)
+    models = quiet_pycolmap().global_mapping(_mapping_database(matched, work, limit, rough), work, work, options)
     return _firmly_connected(_largest(models.values()), shown or matched)
 
 
 def _mapped_one_by_one(
-    matched: MatchedPhotos, progress: Callable[[int], None] | None, shown: MatchedPhotos | None
-) -> Reconstruction | None:
+    matched: MatchedPhotos, progress: Callable[[int], None] | None, shown: MatchedPhotos | None,
+    rough: Reconstruction | None,
+) -> Reconstruction | None:  # fmt: skip
     """What incremental mapping registers.
 
     With the largest keypoints first, then with all, then with less loose thresholds, until all photos are in one model
@@ -123,12 +136,12 @@ def _mapped_one_by_one(
     """
     if not matched.calibrated:
         attempts = [(_MAPPING_KEYPOINTS, 1.0), (None, 1.0), (None, 2.0)]
-        refined = _best_model(matched, attempts, progress)
+        refined = _best_model(matched, attempts, progress, rough)
         if refined is not None and 2 * refined.num_reg_images() >= len(matched.names):
             matched = _refined(matched, refined)
         matched = replace(matched, calibrated=True)
     attempts = [(_MAPPING_KEYPOINTS, LOOSE), (None, LOOSE), (None, 2.0), (None, 1.0)]
-    return _firmly_connected(_best_model(matched, attempts, progress), shown or matched)
+    return _firmly_connected(_best_model(matched, attempts, progress, rough), shown or matched)
 
 
 def _firmly_connected(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
@@ -155,8 +168,9 @@ def _largest(models: Iterable[Any]) -> Any:
 
 
 def _best_model(
-    matched: MatchedPhotos, attempts: Sequence[tuple[int | None, float]], progress: Callable[[int], None] | None
-) -> Any:
+    matched: MatchedPhotos, attempts: Sequence[tuple[int | None, float]], progress: Callable[[int], None] | None,
+    rough: Reconstruction | None,
+) -> Any:  # fmt: skip
     """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None.
 
     They end when all photos are registered, or when one with all keypoints gains nothing.
@@ -174,7 +188,7 @@ def _best_model(
 
         work = Path(mkdtemp(prefix="mapping-", dir=matched.database.parent))
         models = pycolmap.incremental_mapping(
-            _mapping_database(matched, work, limit),
+            _mapping_database(matched, work, limit, rough),
             work,
             work,
             _mapping_options(loose, matched),

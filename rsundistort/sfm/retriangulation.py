@@ -10,7 +10,7 @@ from ..colmap.conventions import quiet_pycolmap, rigid_of
 from ..colmap.lenses import camera_to_colmap
 from ..model import Reconstruction, RowMotion
 from .database import MatchedPhotos, from_pycolmap, ideal_keypoints, pipeline_options
-from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches, photo_pairs
+from .epipolar import TIGHT_PX, FreedMatches, matches_that_fit
 
 __all__ = ["retriangulate"]
 
@@ -41,9 +41,9 @@ def retriangulate(
     pycolmap = quiet_pycolmap()
     freed, cameras = FreedMatches(matched, reconstruction), reconstruction.cameras
     tight_px = TIGHT_PX * matched.step_px
+    explained = matches_that_fit(matched, reconstruction)
+    depths = freed.depths(explained)
     with pycolmap.Database.open(matched.database) as db:
-        explained = _explained(db, freed)
-        depths = freed.depths(explained)
         for index, camera in enumerate(cameras):
             db.update_camera(camera_to_colmap(camera, True, index + 1))
         for index, found in enumerate(matched.features):
@@ -74,19 +74,6 @@ def retriangulate(
         empty, matched.database, matched.database.parent, matched.database.parent, options=options
     )
     return from_pycolmap(model, matched, reconstruction)
-
-
-def _explained(db: Any, freed: FreedMatches) -> Matches:
-    """The matches that fit the poses."""
-    found = Matches()
-    for first, second in photo_pairs(db.read_all_matches()[0]):
-        if freed.posed[first] < 0 or freed.posed[second] < 0:
-            continue
-        matches = np.asarray(db.read_matches(first + 1, second + 1))
-        explained = matches[freed.explained(first, second, matches)]
-        if len(explained) >= MIN_EXPLAINED:
-            found[first, second] = explained
-    return found
 
 
 def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,19 +19,22 @@ from ..model import Reconstruction
 from ..model.array_types import Array, Index
 from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.database import without_motions
-from ..sfm.mapping import PLACING_KEYPOINTS
+from ..sfm.epipolar import matches_that_fit
 from ..sfm.matching import LOOSE_PX, close_px, match_more
+from .solutions import consistent
 from .tracks import NO_PARALLAX
 
-__all__ = ["OF_CLIP", "match_without_motions", "place_photos"]
+__all__ = ["map_key_frames", "match_without_motions", "place_photos"]
 
 # Verified matches of a pair that overlaps, beyond doubt.
 _MANY = 100
 # Verified matches of a pair with which coarse features do. With more photos than `_ASKED`, so many pairs in their order
 # are asked before all are matched, of which most must have that; each photo then has half of it at least.
 _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
-#: Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
-OF_CLIP = (512, 2048, None)
+# Key frames are mapped again so often at most.
+_MAPPING_ROUNDS = 3
+# Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
+_OF_CLIP = (512, 2048, None)
 
 
 def place_photos(
@@ -78,8 +81,8 @@ def place_photos(
     mapped: Reconstruction | None = kept.get(key)
     if mapped is None:
         try:
-            keypoints = OF_CLIP if of_clip else PLACING_KEYPOINTS
-            mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)), keypoints)
+            map_them = map_key_frames if of_clip else map_photos
+            mapped = map_them(matched, lambda done: log.tell("mapping", done, len(photos.names)))
         except ReconstructionError as error:
             overlapping = sum(count >= _MANY for count in read_num_verified(matched).values())
             if overlapping < len(photos.names) - 1:
@@ -88,6 +91,37 @@ def place_photos(
         kept.put(key, mapped)
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
     return mapped, matched
+
+
+def map_key_frames(matched: MatchedPhotos, progress: Callable[[int], None] | None = None) -> Reconstruction:
+    """Key frames of a video, mapped again by the matches that fit their poses until that moves none of them.
+
+    Neighbours of a video have hardly any parallax, and what they show may be one plane: false matches, and inexact
+    ones, which have room for a shutter, may turn the rest of a video at any key frame, and give it another scale. Each
+    half fits itself, so that nothing shows it; but few of these matches fit the poses.
+
+    Parameters and errors are those of `sfm.map_photos`.
+    """
+    mapped = map_photos(matched, progress, _OF_CLIP)
+    num_fitting = _num_fitting(matched, mapped)
+    for _ in range(_MAPPING_ROUNDS):
+        rough, before = mapped, num_fitting
+        try:
+            again = map_photos(replace(matched, cameras=rough.cameras), keypoints=_OF_CLIP, rough=rough)
+        except ReconstructionError:
+            break
+        num_fitting = _num_fitting(matched, again)
+        if again.num_images < rough.num_images or num_fitting < before:
+            break
+        mapped = again
+        if consistent(rough, again):
+            break
+    return mapped
+
+
+def _num_fitting(matched: MatchedPhotos, reconstruction: Reconstruction) -> int:
+    """How many matches fit poses."""
+    return sum(map(len, matches_that_fit(matched, reconstruction).values()))
 
 
 def _match(

@@ -23,7 +23,7 @@ from ..input.stabilisation import Stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..model import Camera, Reconstruction, opposite
-from ..sfm import MatchedPhotos, map_photos, retriangulate
+from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.judge_path import SIGMAS
 from .clip_direction import likely_directions, read_along
 from .clip_gyroscope import felt_gyroscope, own_gyroscope, readout_of
@@ -34,7 +34,7 @@ from .clip_tracks import Followed, focused_as, follow_points, followed_again, wi
 from .clip_verdict import FoundPath, judged
 from .missing_frames import tell_of_gaps, with_gaps
 from .outcome import Solved
-from .placing import OF_CLIP, place_photos
+from .placing import map_key_frames, place_photos
 from .shaking import held_by_slow_rotations
 from .tracks import rough_options, tell
 
@@ -334,7 +334,7 @@ def _travelled(
         log.begin("mapping again")
         try:
             lens = found.result.reconstruction.cameras
-            mapped = map_photos(replace(matched, cameras=lens, calibrated=True), keypoints=OF_CLIP)
+            mapped = map_key_frames(replace(matched, cameras=lens, calibrated=True))
         except ReconstructionError:
             break
         finally:
@@ -399,6 +399,12 @@ def _first_path(
     options = replace(options_of(whole), path=held)
     by_lens = _with_known_lens if matched.calibrated else _with_unknown_lens
     result = by_lens(whole, _at_first(options), log)
+    if held.held_sigma:
+        # what a rough scene shows, and no path follows, a better one may not
+        free = by_lens(whole, _at_first(replace(options, path=path)), log)
+        own = own_motions(free.reconstruction)
+        if not held_by_slow_rotations(clip, free.reconstruction, path, own).held_sigma:
+            options, result = replace(options, path=path), free
     _end_path(log, "path", clip, whole, result)
     return _TravelledPath(clip, path, options, filmed, result, scene, followed)
 
