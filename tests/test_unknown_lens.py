@@ -82,7 +82,7 @@ def clip_of(monkeypatch):
             result = SimpleNamespace(reconstruction=of_lens(f), sigma_px=sigma_px)
             return SimpleNamespace(clip=None, result=result, options=None, filmed=None)
 
-        monkeypatch.setattr(video_path, "map_photos", map_again)
+        monkeypatch.setattr(video_path, "map_key_frames", map_again)
         monkeypatch.setattr(video_path, "_first_path", lambda *_: path(*next(firsts)))
         monkeypatch.setattr(video_path, "_path_again", lambda *_: path(next(lasts), 0.1))
         placed = of_lens(500.0), Matches(calibrated)
