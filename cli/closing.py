@@ -17,6 +17,8 @@ __all__ = ["close", "closing_table", "fitted", "summary"]
 
 
 _COLUMNS = 80
+# what displaces no tenth of a pixel is no news: of a focal length that varies, that is a hundredth of a percent
+_LEAST_PX, _LEAST_FOCAL = 0.1, 1e-4
 # where what is said of a label begins, and the label of what goes on there
 _LABEL, _GOES_ON = 19, " "
 
@@ -182,14 +184,16 @@ def _lens(solution: Solution) -> Iterator[tuple[str, str]]:
         focal, centre = quality["focal_sigma"], quality["centre_sigma_focal_lengths"]
         if centre:
             centre_px = centre * next(iter(solution.cameras.values())).K[0, 0]
-            said = f"f by {100 * focal:.2g} %, principal point by {centre_px:.1f} px from photo to photo"
-            yield "varying lens", f"{said} (focusing, a stabiliser)"
-        elif focal >= 1e-4:  # of a video, by a hundredth of a percent at least: a tenth of a pixel
+            if focal >= _LEAST_FOCAL or centre_px >= _LEAST_PX:
+                said = f"f by {100 * focal:.2g} %, principal point by {centre_px:.1f} px from photo to photo"
+                yield "varying lens", f"{said} (focusing, a stabiliser)"
+        elif focal >= _LEAST_FOCAL:
             yield "varying lens", f"f by {100 * focal:.2g} % from frame to frame (focusing, zooming)"
     if fields := quality.get("lens_fields"):
         largest = max(fields.values(), key=lambda each: each["rms_px"])
-        said = f"{largest['rms_px']:.2f} px in the mean, {largest['largest_px']:.2f} at most"
-        yield "more than a lens", f"{said}, beside the lens model (+-{largest['sigma_px']:.2f})"
+        if largest["largest_px"] >= _LEAST_PX:
+            said = f"{largest['rms_px']:.2f} px in the mean, {largest['largest_px']:.2f} at most"
+            yield "more than a lens", f"{said}, beside the lens model (+-{largest['sigma_px']:.2f})"
 
 
 def _shutter(solution: Solution) -> Iterator[tuple[str, str]]:

@@ -406,7 +406,7 @@ def at_once(tmp_path_factory):
 @pytest.mark.slow
 def test_a_video_of_a_global_shutter_needs_no_correction_if_the_user_says_what_it_is(at_once, tmp_path):
     how = RunOptions(max_features=1000)
-    with pytest.warns(RsUndistortWarning, match="if the camera has a global shutter, run it with --model global"):
+    with pytest.warns(RsUndistortWarning, match="if the camera has a global shutter: run --model global"):
         unsaid = run(at_once, tmp_path / "unsaid", how)
     assert unsaid.verdict["shutter"] == "not-determined"
     said = run(at_once, tmp_path / "said", replace(how, solve=SolveOptions(shutter_model="global")))

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sift_like import sift_like
 
-from rsundistort import Camera
+from rsundistort import Camera, RowMotion, project_points
+from rsundistort.model.projection import unproject_points
 from rsundistort.sfm.features import Features
-from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _with_likeliest_focal, seen_again
+from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _with_likeliest_lens, seen_again
 
 F = 500.0
 CAMERA = Camera(640, 360, [[F, 0, 320], [0, F, 180], [0, 0, 1]])
@@ -90,7 +91,7 @@ def test_a_frame_after_a_cut_is_rotated_by_the_features_that_it_shows_again() ->
 @pytest.mark.parametrize("guess", [300.0, 480.0, 700.0])
 def test_a_pan_says_the_focal_length_that_nobody_knows(guess: float) -> None:
     corners = [two_frames(np.random.default_rng(seed), 0.1) for seed in range(12)]
-    found = _with_likeliest_focal(corners, Camera(640, 360, [[guess, 0, 320], [0, guess, 180], [0, 0, 1]]))
+    found = _with_likeliest_lens(corners, Camera(640, 360, [[guess, 0, 320], [0, guess, 180], [0, 0, 1]]))
     assert abs(found.K[0, 0] / F - 1.0) < 0.04
     assert found.K[0, 0] == found.K[1, 1]
     np.testing.assert_array_equal(found.K[:2, 2], [320, 180])
@@ -98,7 +99,31 @@ def test_a_pan_says_the_focal_length_that_nobody_knows(guess: float) -> None:
 
 def test_corners_that_say_nothing_of_a_focal_length_leave_the_guess() -> None:
     nothing = np.zeros((3, 2)), np.zeros((3, 2))
-    assert _with_likeliest_focal([nothing], CAMERA) == CAMERA
+    assert _with_likeliest_lens([nothing], CAMERA) == CAMERA
     xy = np.random.default_rng(0).uniform([0, 0], [640, 360], (150, 2))
     slides_by = xy, xy + np.array([40.0, 3.0])
-    assert _with_likeliest_focal([slides_by], CAMERA) == CAMERA
+    # if its lens is known; some wide one would show a pan so
+    known = replace(CAMERA, dist=[-0.01, 0.0, 0.0, 0.0])
+    assert _with_likeliest_lens([slides_by], known) == known
+
+
+def test_a_pan_by_a_lens_that_nobody_knows_is_one() -> None:
+    # an action camera's: whatever the focal length, without it rotations leave more than a pixel
+    wide = replace(CAMERA, K=[[400.0, 0, 320], [0, 400.0, 180], [0, 0, 1]], dist=[-0.3, 0.1, 0.0, 0.0])
+    corners = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        xy = rng.uniform([0, 0], [640, 360], (250, 2))
+        rays = np.column_stack([unproject_points(xy, wide, RowMotion(), "global")[0], np.ones(250)])
+        turned = rays @ Rotation.from_rotvec([0.01, 0.1, -0.01]).as_matrix().T
+        after, valid = project_points(turned, wide, RowMotion(), "global")
+        corners.append(tuple(each[valid] + rng.normal(0, 0.05, (valid.sum(), 2)) for each in (xy, after)))
+    guess = Camera(640, 360, [[550.0, 0, 320], [0, 550.0, 180], [0, 0, 1]])
+    found = _with_likeliest_lens(corners, guess)
+    assert found.dist[0] < -0.15
+    left = [550.0 * np.median([_beyond_rotation(*each, lens) for each in corners]) for lens in (guess, found)]
+    assert left[0] > 2 * _LEFT_PX
+    assert left[1] < _LEFT_PX
+    # a lens that is known is not made another
+    known = replace(guess, dist=[-0.05, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(_with_likeliest_lens(corners, known).dist, known.dist)

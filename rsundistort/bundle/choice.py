@@ -316,7 +316,9 @@ def _doubts(fits: ModelFits, best: ModelFit, plain: ModelFit, gain: dict[str, fl
         return ["a shutter that reads along the other axis explains the photos as well"], None
     agreement = fits.agreement(best)
     if agreement < MIN_AGREEMENT:
-        return [f"two halves of the scene show different motions (correlation {agreement:.2f})"], agreement
+        return [
+            f"two halves of the scene do not ask for the same motions in the same photos (correlation {agreement:.2f})"
+        ], agreement
     return [], agreement
 
 

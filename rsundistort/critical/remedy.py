@@ -28,6 +28,8 @@ _SHARE = 0.1
 _NONE = 10.0
 # A still photo is contradicted if its stillness is less likely than this.
 _UNLIKELY = 0.01
+# So is one whose rotation about the held axis the others show by so many standard deviations.
+_SHOWN = 5.0
 # Root mean square over the frame of what grows by one from the first row to the last.
 _RMS = 1.0 / np.sqrt(12.0)
 
@@ -48,6 +50,8 @@ class Remedy:
         Cost of the solutions without and with it.
     warnings : tuple of str
         Constraints that the evidence contradicts, and uncertainties of a pixel and more.
+    contradictions : tuple of str
+        The former alone.
     """
 
     name: str
@@ -55,6 +59,7 @@ class Remedy:
     before: ShapeCost
     after: ShapeCost
     warnings: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
 
     def added_to(self, options: BundleOptions) -> BundleOptions:
         """The options of an adjustment, with the photo that the remedy took as still."""
@@ -170,17 +175,21 @@ def contradictions(result: BundleResult, options: BundleOptions, names: Collecti
         return ()
     rec = result.reconstruction
     probability = still_probability(result, options)
-    motion = _freed(result, options).motions()[0]
+    motion, covariance = _freed(result, options).motions()
     span = rec.frame_span()
     components = row_phi(rec)
     found = []
     for name in names:
         i = rec.image_names.index(name)
-        if probability[i] < _UNLIKELY:
-            rotation = np.degrees(np.linalg.norm(motion[i, components[i, 1:]]) * span[i])
+        phi1 = components[i, 0]
+        # what is held tells as well, where the other photos determine it
+        shows = bool(abs(motion[i, phi1]) > _SHOWN * np.sqrt(covariance[i, phi1, phi1]))
+        if shows or probability[i] < _UNLIKELY:
+            rotation = np.degrees(np.linalg.norm(motion[i, components[i, 0 if shows else 1 :]]) * span[i])
             found.append(
-                f"{name} was specified as still, but it rotated by {rotation:.2f} degrees about its other axes "
-                "during the readout; the scene's height is only as right as that"
+                f"{name} was specified as still, but it rotated by {rotation:.2f} degrees "
+                f"{'' if shows else 'about its other axes '}during the readout; the scene's height is only as right as "
+                "that"
             )
     return tuple(found)
 
@@ -214,7 +223,7 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     given = still | {name: float(np.min(sigma)) for name, (_, sigma) in options.known_phi.items()}
     if given or measured_lengths(result.reconstruction, options.lengths)[0]:
         said = contradictions(result, options, still)
-        return result, Remedy("given", given, before, before, said + _warnings(before))
+        return result, Remedy("given", given, before, before, said + _warnings(before), said)
     if remedy == "none":
         return result, Remedy("none", {}, before, before, _warnings(before))
     if not (before.is_flagged or before.common.is_weak) or not np.isfinite(before.sigma_log_k):

@@ -370,7 +370,7 @@ def _judge(
     if detectable and high < least:
         return "stabilised", (
             f"stabilised in the camera: rotation between the frames without its shutter (readout {found}, expected "
-            f"{wanted}; if the camera has a global shutter, run it with --model global)"
+            f"{wanted}; if the camera has a global shutter: run --model global)"
         )
     if detectable and low > most:
         return "stabilised", (

@@ -197,7 +197,8 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
         rows += [(frame_of[image_id], number, seen[image_id]) for image_id in sorted(seen)]
     if not track_points:
         raise ReconstructionError(
-            "the photos were registered, but no scene point could be triangulated; check the camera's focal length"
+            "the photos were registered, but no scene point could be triangulated: from one spot there is no parallax; "
+            "use photos from places apart, or check the camera's focal length"
         )
     frame, point_idx, keypoint = np.array(rows).T
     found = [matched.features[image_id - 1] for image_id in ids]

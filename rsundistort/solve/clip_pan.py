@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from ..input.key_frames import Clip
@@ -35,6 +36,12 @@ _TRIALS = 20
 _SAMPLES, _FEW, _FAST, _AT_FIRST, _FITS = 100, 6, 0.1, 6.0, 10
 # A focal length that nobody knows is off by such a factor at most; how many are tried, and key frames asked.
 _MOST_OFF, _GRID, _ASKED = 2.0, 9, 6
+# Distortions k1 of wide lenses that are tried where none is known, in pixels what of these may be left at first, trials
+# that find the best one, and how much less likely a lens gets per standard deviation, in pixels.
+_WIDE, _NEAR_PX, _LENS_TRIALS, _UNLIKELY_PX = (-0.1, -0.2, -1.0 / 3.0), 1.0, 80, 0.02
+# What is left by it must be so much less than by no perspective at all: what slides by is seen by any lens.
+_MUCH_LESS = 0.5
+_LENS_SIGMAS = np.array([0.5, 0.2, 0.2])
 # Key frames before a cut that one after it may show again, and its features that may.
 _LAST, _MATCHED = 4, 2048
 
@@ -49,7 +56,7 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     step = np.array([camera.width, camera.height]) / flow_size(camera.width, camera.height)
     corners = [(step * (each.first_xy + 0.5) - 0.5, step * (each.second_xy + 0.5) - 0.5) for each in clip.flows]
     if corners and keys.cameras.without_focal:
-        camera = _with_likeliest_focal(corners, camera)
+        camera = _with_likeliest_lens(corners, camera)
     # corners of key frames show it in no time, so that the frames between need not be followed
     if corners and not _only_rotates([_beyond_rotation(first, second, camera) for first, second in corners], camera):
         return None
@@ -61,30 +68,72 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     return _joined(clip, camera, chained[0], shown, *chained[1:])
 
 
-def _with_likeliest_focal(corners: Sequence[_Corners], camera: Camera) -> Camera:
+def _with_likeliest_lens(corners: Sequence[_Corners], camera: Camera) -> Camera:
     """The camera with the focal length by which rotations explain corners of key frames and the next ones best.
 
-    That of a guess, since no parallax says more, may be off by half, and rotations do not explain any frame by it.
+    That of a guess, since no parallax says more, may be off by half, and rotations do not explain any frame by it. If
+    they do by no focal length, the lens of an action camera may be the reason: what it distorts slides by evenly, as if
+    the focal length were longer.
     """
     some = [corners[k] for k in np.unique(np.linspace(0, len(corners) - 1, _ASKED).astype(int)).tolist()]
 
-    def with_focal(log_ratio: float) -> Camera:
-        ratio = np.exp(log_ratio)
-        return replace(camera, K=camera.K * [[ratio, 1.0, 1.0], [1.0, ratio, 1.0], [1.0, 1.0, 1.0]])
-
-    def left_px(log_ratio: float) -> float:
-        other = with_focal(log_ratio)
-        left = float(np.median([_beyond_rotation(first, second, other) for first, second in some]))
-        return left * float(other.K[0, 0])
+    def left_px(log_ratio: float, *distortion: float) -> float:
+        other = _with_lens(camera, log_ratio, *distortion)
+        return float(np.median([_beyond_rotation_px(first, second, other) for first, second in some]))
 
     tried = np.linspace(-np.log(_MOST_OFF), np.log(_MOST_OFF), _GRID)
     values = [left_px(each) for each in tried.tolist()]
     best = int(np.argmin(values))
+    found = camera
     # what slides by without any perspective asks for ever longer ones
-    if best in (0, _GRID - 1) or not np.isfinite(values[best]):
-        return camera
-    around = tried[best - 1], tried[best + 1]
-    return with_focal(float(minimize_scalar(left_px, bounds=around, method="bounded", options={"xatol": 1e-3}).x))
+    if best not in (0, _GRID - 1) and np.isfinite(values[best]):
+        around = tried[best - 1], tried[best + 1]
+        log_ratio = minimize_scalar(left_px, bounds=around, method="bounded", options={"xatol": 1e-3}).x
+        found = _with_lens(camera, float(log_ratio))
+        if left_px(float(log_ratio)) < _LEFT_PX:
+            return found
+    if camera.lens != "pinhole" or camera.dist.any():
+        return found
+
+    def unlikeliness(lens: Array) -> float:
+        left = left_px(*lens.tolist())
+        return left + _UNLIKELY_PX * float(((lens / _LENS_SIGMAS) ** 2).sum()) if np.isfinite(left) else np.inf
+
+    # k2 as where all directions are spread evenly: r_d = arctan(w r) / w, with k1 = -w^2 / 3
+    lenses = [np.array([log_ratio, k1, 1.8 * k1**2]) for k1 in _WIDE for log_ratio in tried.tolist()]
+    costs = [unlikeliness(each) for each in lenses]
+    if not min(costs) < _NEAR_PX:
+        return found
+    start = lenses[int(np.argmin(costs))]
+    simplex = start + np.vstack([np.zeros(3), 0.3 * np.diag(_LENS_SIGMAS)])
+    how = {"maxfev": _LENS_TRIALS, "initial_simplex": simplex}
+    nearest: Any = minimize(unlikeliness, start, method="Nelder-Mead", options=how)  # type: ignore[call-overload]
+    if left_px(*nearest.x.tolist()) > min(_LEFT_PX, _MUCH_LESS * values[-1]):
+        return found
+    return _with_lens(camera, *nearest.x.tolist())
+
+
+def _with_lens(camera: Camera, log_ratio: float, *distortion: float) -> Camera:
+    """The camera with another focal length, and k1 and k2, if they are given."""
+    ratio = np.exp(log_ratio)
+    other = replace(camera, K=camera.K * [[ratio, 1.0, 1.0], [1.0, ratio, 1.0], [1.0, 1.0, 1.0]])
+    return replace(other, dist=np.array([*distortion, 0.0, 0.0])) if distortion else other
+
+
+def _beyond_rotation_px(xy_before: Array, xy_after: Array, camera: Camera) -> float:
+    """Median distance of pixels (n, 2) of two frames beyond what rotations of their lines explain, in such pixels.
+
+    Lenses differ by how much of the tangent plane a pixel is.
+    """
+    left = _sizes_beyond_rotation(xy_before, xy_after, camera)
+    if left is None:
+        return float("inf")
+    ends = (
+        [unproject_points(xy_after + sign * each, camera, RowMotion(), "global")[0] for sign in (1, -1)]
+        for each in 0.5 * np.eye(2)
+    )
+    (a, b), (c, d) = ((ahead - behind).T for ahead, behind in ends)
+    return float(np.nanmedian(left / np.sqrt(np.abs(a * d - b * c))))
 
 
 def _only_rotates(left: Sequence[float], camera: Camera) -> bool:
@@ -94,9 +143,15 @@ def _only_rotates(left: Sequence[float], camera: Camera) -> bool:
 
 def _beyond_rotation(xy_before: Array, xy_after: Array, camera: Camera) -> float:
     """Median distance of pixels (n, 2) of two frames, as directions, beyond what rotations of their lines explain."""
+    left = _sizes_beyond_rotation(xy_before, xy_after, camera)
+    return float("inf") if left is None else float(np.nanmedian(left))
+
+
+def _sizes_beyond_rotation(xy_before: Array, xy_after: Array, camera: Camera) -> Array | None:
+    """(n,) those distances, NaN where there is no direction; None if too few pixels agree on a rotation."""
     before, after = _directions(xy_before, camera), _directions(xy_after, camera)
     rotation = _agreed_rotation(before, after, _ROOM_PX / float(camera.K[0, 0]))
-    return float("inf") if rotation is None else _left_by_shutter(before @ rotation.T, after, camera)
+    return None if rotation is None else _sizes_beyond_shutter(before @ rotation.T, after, camera)
 
 
 def _chained(
@@ -190,15 +245,23 @@ def _directions(xy_raw: Array, camera: Camera) -> Array:
 
 def _left_by_shutter(before: Array, after: Array, camera: Camera) -> float:
     """Median distance of directions (n, 3) of two frames, beyond what rotations of their lines explain."""
-    seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
+    left = _sizes_beyond_shutter(before, after, camera)
+    return float("inf") if left is None else float(np.nanmedian(left))
+
+
+def _sizes_beyond_shutter(before: Array, after: Array, camera: Camera) -> Array | None:
+    """(n,) those distances, in the tangent plane; NaN where there is no direction, None if there are too few."""
+    seen = np.asarray(np.isfinite(np.hstack([before, after])).all(axis=1))
     if seen.sum() < _LEAST_AGREEING:
-        return float("inf")
+        return None
     before, after = before[seen], after[seen]
     size = np.full(len(before), np.inf)
     for _ in range(2):  # what both frames were rotated by at first may be off by as much as some things moved
         rotation, size = _rotations_of_lines(before, after, camera)
         before = before @ rotation.T
-    return float(np.median(size))
+    found = np.full(len(seen), np.nan)
+    found[seen] = size
+    return found
 
 
 def _rotations_of_lines(before: Array, after: Array, camera: Camera) -> tuple[Array, Array]:

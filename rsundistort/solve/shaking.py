@@ -13,6 +13,7 @@ from ..bundle.path_prior import FramePath
 from ..errors import RsUndistortWarning
 from ..input.key_frames import Clip
 from ..model import Reconstruction
+from ..verdict.judge_path import SIGMAS
 from ..verdict.speeds import BySpeed, readouts_by_speed
 
 __all__ = ["held_by_slow_rotations", "speeds_of", "tell_if_held", "with_slow_rotations"]
@@ -63,6 +64,8 @@ def held_by_slow_rotations(
         seconds, sigma = speeds.slow
         about = seconds
     if path.readout is not None:
+        if abs(seconds - path.readout[0]) > SIGMAS * np.hypot(sigma, path.readout[1]):
+            return path  # something else bends the lines
         weights = sigma**-2.0, path.readout[1] ** -2.0
         seconds = (weights[0] * seconds + weights[1] * path.readout[0]) / sum(weights)
         sigma = sum(weights) ** -0.5

@@ -187,8 +187,8 @@ def _filmed_by(
         return rotated
     if rotated is None:
         return found
-    # a camera that zooms looks like one that travels; what explains the frames better did
-    explains = explained == "by zooming" and rotated.result.sigma_px <= found.result.sigma_px
+    # a lens that zooms, or that nobody knows, makes of travel a rotation; what explains the frames better was it
+    explains = explained in ("by zooming", "by a lens") and rotated.result.sigma_px <= found.result.sigma_px
     return rotated if explains or (_shows_readout(rotated) and not _shows_readout(found)) else found
 
 
@@ -214,8 +214,8 @@ def _only_rotated(
 ) -> tuple[FoundPath | None, str]:  # fmt: skip
     """The path of a camera that only rotates, if that explains neighbours; and by what it explains all frames.
 
-    "by rotations", of a lens that may focus if that leaves no more than the flow's own error; or "by zooming" only: by
-    a focal length that varies, which takes travel for zoom; "" if by neither.
+    "by rotations", of a lens that may focus if that leaves no more than the flow's own error; "by zooming" only: by a
+    focal length that varies, which takes travel for zoom; "by a lens" whose distortion nobody knew; "" if by none.
     """
     log.begin("rotations")
     start, found, explained = rotating_only(clip, keys), None, ""
@@ -236,6 +236,9 @@ def _only_rotated(
                 break
             if found is None or (explains and not explained):
                 found, explained = other, how if explains else ""
+    knew_lens = start is None or np.array_equal(start.cameras[0].dist, keys.cameras.of(0).dist)
+    if explained == "by rotations" and not knew_lens:
+        explained = "by a lens"
     log.end("rotations", explained=explained)
     return found, explained
 

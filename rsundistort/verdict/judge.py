@@ -220,9 +220,10 @@ def height_reasons(remedy: Remedy | None) -> list[str]:
             "The cameras were not rotated against each other, so the height of the scene is undetermined, and the "
             "remedy is switched off."
         ]
+    contradicted = [f"{text}." for text in remedy.contradictions]
     if not 100 * cost.sigma_log_k <= _SMALL_PERCENT:
-        return [f"{cost.sentence[0].upper()}{cost.sentence[1:]}."]
-    return []
+        return [*contradicted, f"{cost.sentence[0].upper()}{cost.sentence[1:]}."]
+    return contradicted
 
 
 def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> list[str]:
