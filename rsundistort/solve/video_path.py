@@ -215,7 +215,7 @@ def _only_rotated(
     """The path of a camera that only rotates, if that explains neighbours; and by what it explains all frames.
 
     "by rotations", of a lens that may focus if that leaves no more than the flow's own error; "by zooming" only: by a
-    focal length that varies, which takes travel for zoom; "by a lens" whose distortion nobody knew; "" if by none.
+    focal length that varies, which takes travel for zoom; "by a lens" only, whose distortion nobody knew; "" if by none.
     """
     log.begin("rotations")
     start, found, explained = rotating_only(clip, keys), None, ""
@@ -237,7 +237,7 @@ def _only_rotated(
             if found is None or (explains and not explained):
                 found, explained = other, how if explains else ""
     knew_lens = start is None or np.array_equal(start.cameras[0].dist, keys.cameras.of(0).dist)
-    if explained == "by rotations" and not knew_lens:
+    if explained == "by rotations" and not knew_lens and found and found.result.sigma_px >= _EXACT_PX:
         explained = "by a lens"
     log.end("rotations", explained=explained)
     return found, explained
