@@ -215,7 +215,7 @@ def _only_rotated(
     """The path of a camera that only rotates, if that explains neighbours; and by what it explains all frames.
 
     "by rotations", of a lens that may focus if that leaves no more than the flow's own error; "by zooming" only: by a
-    focal length that varies, which takes travel for zoom; "by a lens" only, whose distortion nobody knew; "" if by none.
+    focal length that varies, which takes travel for zoom; "by a lens" only, whose distortion nobody knew; or "".
     """
     log.begin("rotations")
     start, found, explained = rotating_only(clip, keys), None, ""
