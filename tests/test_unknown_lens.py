@@ -84,7 +84,14 @@ def clip_of(monkeypatch):
 
         monkeypatch.setattr(video_path, "map_key_frames", map_again)
         monkeypatch.setattr(video_path, "_first_path", lambda *_: path(*next(firsts)))
-        monkeypatch.setattr(video_path, "_path_again", lambda *_: path(next(lasts), 0.1))
+
+        def again(*_):
+            last = next(lasts)
+            if last is None:
+                raise ReconstructionError("no points")
+            return path(*last) if isinstance(last, tuple) else path(last, 0.1)
+
+        monkeypatch.setattr(video_path, "_path_again", again)
         placed = of_lens(500.0), Matches(calibrated)
         found = _travelled(None, None, None, StageLog(None), None, lambda: placed)
         assert not [*firsts], "a path was not asked for"
@@ -113,6 +120,11 @@ def test_photos_that_cannot_be_mapped_again_keep_their_scene(clip_of):
 def test_the_last_adjustment_is_repeated_while_it_moves_the_lens_but_not_forever(clip_of):
     assert clip_of([(500.0, 0.2)], [470.0, 465.0])[1] == 465.0
     assert clip_of([(500.0, 0.2)], [470.0, 440.0, 410.0])[1] == 410.0
+
+
+@pytest.mark.parametrize("again", [(1230.0, 0.11), None], ids=["fits-less", "no-points"])
+def test_a_last_adjustment_that_runs_away_is_not_taken(clip_of, again):
+    assert clip_of([(500.0, 0.2)], [470.0, again])[1] == 470.0
 
 
 def test_the_lens_of_a_camera_that_is_given_is_believed(clip_of):

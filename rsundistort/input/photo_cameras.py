@@ -136,7 +136,8 @@ class PhotoCameras:
                 value = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **cameras[k].coefficients}[name]
                 raise ReconstructionError(
                     f"the photos do not determine their camera: {name} = {value:.3g} would be {times:.0f} standard "
-                    "deviations from what such cameras have; give --camera FILE or --camera fx,fy,cx,cy in pixels"
+                    "deviations from what such cameras have; give --camera FILE or --camera fx,fy,cx,cy in pixels "
+                    "(of a fisheye a FILE, which names its lens)"
                 )
 
     def contradicted(self, cameras: Sequence[Camera], options: BundleOptions) -> list[str]:

@@ -346,11 +346,19 @@ def _travelled(
         if not other.result.sigma_px < found.result.sigma_px:
             break
         found = other
-    for _ in range(_LENS_ROUNDS):
-        before = found.result.reconstruction.cameras[0]
-        found = _path_again(found, options_of, log, matched)
+    for repeats in range(_LENS_ROUNDS):
+        before = found
+        try:
+            found = _path_again(before, options_of, log, matched)
+        except ReconstructionError:
+            if not repeats:
+                raise
+            break
+        if repeats and found.result.sigma_px > before.result.sigma_px:
+            found = before  # it ran away, as where frames that were knocked are among them
+            break
         # what was an outlier by one lens is none by another
-        if matched.calibrated or not _is_other_lens(found.result, before, _SOLVED_BY):
+        if matched.calibrated or not _is_other_lens(found.result, before.result.reconstruction.cameras[0], _SOLVED_BY):
             break
     return FoundPath(found.clip, found.result, found.options, found.filmed)
 
