@@ -92,3 +92,12 @@ def test_what_lens_and_scene_leave_is_no_shaking(monkeypatch, size_px, held):
     monkeypatch.setattr(shaking, "speeds_of", lambda *_, **__: said)
     path = FramePath({"a": 0.0, "b": 1 / 30}, 1 / 30)
     assert bool(held_by_slow_rotations(None, rec, path, None).held_sigma) == held
+
+
+@pytest.mark.parametrize(("known", "held"), [((0.021, 4e-4), True), ((0.030, 6e-4), False)])
+def test_slow_rotations_that_contradict_a_known_readout_time_hold_nothing(monkeypatch, known, held):
+    rec = SimpleNamespace(cameras=[SimpleNamespace(K=np.diag([500.0, 500.0, 1.0]))])
+    said = BySpeed(ReadoutTime(0.02, 1e-3), None, 0.5, 1e-3)
+    monkeypatch.setattr(shaking, "speeds_of", lambda *_, **__: said)
+    path = FramePath({"a": 0.0, "b": 1 / 30}, 1 / 30, known)
+    assert bool(held_by_slow_rotations(None, rec, path, None).held_sigma) == held

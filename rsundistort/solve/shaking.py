@@ -51,8 +51,9 @@ def held_by_slow_rotations(
     """The path, its readout time held where the camera shakes faster than its frames show.
 
     A path through such frames is too smooth: lines rotate faster than it does, which looks like a longer readout.
-    Slow rotations are the same in lines and frames, and what is known of the readout counts beside them. Motions that
-    were found before any path are too rough to fill in frames that are missing.
+    Slow rotations are the same in lines and frames, and what is known of the readout counts beside them; if it
+    contradicts them, something else bends the lines, and nothing is held. Motions that were found before any path are
+    too rough to fill in frames that are missing.
     """
     about = path.readout_prior[0] * path.frame_s
     for _ in range(2):  # lines average over the readout, so that it counts a little
