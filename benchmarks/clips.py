@@ -11,7 +11,9 @@ Renders clips of each kind and prints one JSON object a line: how strong the shu
     street  a walk along a street, of a phone's or an action camera's 854x480; at 1.2 m a second
     round   the same size, round a thing again and again, as who scans it: once in ten seconds, each time at another
             height and distance; at least 300 frames, so that all of the yard is seen
-    vibrating  a walk that shakes at up to 24 Hz, with 30 frames a second. The last three only if asked for
+    vibrating  a walk that shakes at up to 24 Hz, with 30 frames a second
+    gimbal  three seconds along a street, level and without any tremor, while the camera yaws to and fro. The last four
+            only if asked for
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from rsundistort import read_solution
 from rsundistort.simulate import SceneOptions, simulate_scene
 
 SHORT = ("walk", "level", "pan", "two")
-KINDS = (*SHORT, "street", "round", "vibrating")
+KINDS = (*SHORT, "street", "round", "vibrating", "gimbal")
 WIDTH, HEIGHT, FOCAL_PX = 640, 360, 500.0
 # 4 samples a pixel: a frame is 41 dB from one of 64, which is less than its noise would be; 16 take three times as long
 SAMPLES = 4
@@ -179,6 +181,19 @@ def long_path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str,
     }  # fmt: skip
 
 
+def gimbal_path(rng: np.random.Generator, num_frames: int) -> dict[str, Any]:
+    """The path of a camera on a gimbal, or of a drone's, that flies along the street and yaws to and fro."""
+    time_s = np.linspace(0.0, num_frames / 30, 13)
+    speed, far, fast = (float(rng.uniform(*limits)) for limits in ((1.5, 6.0), (0.3, 0.6), (1.0, 1.6)))
+    yaw = far * np.sin(fast * time_s + rng.uniform(0.0, 2 * np.pi))
+    side, high = rng.uniform(-0.5, 0.5), rng.uniform(1.6, 3.0)
+    places = np.column_stack([np.full(len(time_s), side), speed * time_s, np.full(len(time_s), high)])
+    targets = places + 6 * np.column_stack([np.sin(yaw), np.cos(yaw), np.zeros(len(time_s))])
+    way = [{"center_w": c.tolist(), "look_at_w": t.tolist()} for c, t in zip(places, targets, strict=True)]
+    readout = float(rng.uniform(0.3, 0.9))
+    return {"kind": "walk", "fps": 30, "num_frames": num_frames, "readout": readout, "way": way, "level": True}
+
+
 def path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str, Any]:
     """The path of a clip."""
     readout = float(rng.uniform(0.2, 0.9))
@@ -235,8 +250,13 @@ def clip_recipe(kind: str, seed: int, num_frames: int = 60) -> dict[str, Any]:
     is_long = kind in ("street", "round")
     width, height, focal_px = LONG if is_long else (WIDTH, HEIGHT, FOCAL_PX)
     K = [[focal_px, 0, width / 2 + 1.5], [0, focal_px, height / 2 - 1.75], [0, 0, 1]]
-    taken = (long_path if is_long else path)(kind, rng, num_frames)
-    if kind == "street":
+    if kind == "gimbal":
+        taken = gimbal_path(rng, num_frames)
+    else:
+        taken = (long_path if is_long else path)(kind, rng, num_frames)
+    if kind == "gimbal":
+        around, textures = street(rng, taken["way"][-1]["center_w"][1])
+    elif kind == "street":
         around, textures = street(rng, _SPEED * num_frames / 30)
     else:
         around, textures = yard(rng) if kind == "round" else surfaces(rng), TEXTURES

@@ -13,6 +13,7 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     two      two frames whose readout time is known: how far off the corrected positions are
     readout  random walks, gentle to wild: errors of the readout time, and these over their standard deviations
     vibrating  likewise walks that shake at up to 24 Hz, faster than frames can show
+    gimbal     likewise level cameras without any tremor, along a street, that yaw to and fro
     stabilised  walks, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
     edited   random walks as programs, lamps and passers-by leave them (`edited.py`): readout times, by the path and by
              slow rotations alone, and verdicts; only some edits with `--edit`, and of other clips with `--kind`
@@ -93,6 +94,7 @@ PARTS = (
     "two",
     "readout",
     "vibrating",
+    "gimbal",
     "stabilised",
     "edited",
     "gopro",
@@ -289,7 +291,7 @@ def of_kind(kind: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Random clips of a kind."""
     values = []
     for seed in range(args.first_seed, args.first_seed + args.num):
-        folder = clip_folder(args.clips, kind, seed)
+        folder = clip_folder(args.clips, kind, seed, 90 if kind == "gimbal" else 60)
         known = read_solution(folder / "ground_truth.json").options["readout_ms"] / 1e3 if kind == "two" else None
         try:
             solved, cpu_s = solved_clip(folder / "clip.mp4", str(folder / "camera.json"), known)
@@ -298,7 +300,7 @@ def of_kind(kind: str, args: argparse.Namespace) -> list[dict[str, Any]]:
             values.append({"error": str(error)})
             continue
         value = judged(folder, solved, cpu_s)
-        if kind in ("pan", "walk", "vibrating"):
+        if kind in ("pan", "walk", "vibrating", "gimbal"):
             value |= against_references(folder / "clip.mp4", solved)
         if kind == "two":
             value |= positions(folder, solved)
@@ -521,6 +523,7 @@ def main() -> None:
                 "walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro, "peer": peer,
                 "length": length, "unordered": unordered, "edited": edits,
                 "vibrating": partial(readout, kind="vibrating"),
+                "gimbal": partial(readout, kind="gimbal"),
             }[part](args)  # fmt: skip
 
 
