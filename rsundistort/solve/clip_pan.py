@@ -106,11 +106,11 @@ def _with_likeliest_lens(corners: Sequence[_Corners], camera: Camera) -> Camera:
         return found
     start = lenses[int(np.argmin(costs))]
     simplex = start + np.vstack([np.zeros(3), 0.3 * np.diag(_LENS_SIGMAS)])
-    how = {"maxfev": _LENS_TRIALS, "initial_simplex": simplex}
-    nearest: Any = minimize(unlikeliness, start, method="Nelder-Mead", options=how)  # type: ignore[call-overload]
-    if left_px(*nearest.x.tolist()) > min(_LEFT_PX, _MUCH_LESS * values[-1]):
+    how: Any = {"maxfev": _LENS_TRIALS, "initial_simplex": simplex}
+    best_lens = np.asarray(minimize(unlikeliness, start, method="Nelder-Mead", options=how).x).tolist()
+    if left_px(*best_lens) > min(_LEFT_PX, _MUCH_LESS * values[-1]):
         return found
-    return _with_lens(camera, *nearest.x.tolist())
+    return _with_lens(camera, *best_lens)
 
 
 def _with_lens(camera: Camera, log_ratio: float, *distortion: float) -> Camera:
