@@ -119,9 +119,37 @@ def test_noise_in_the_dark_is_no_texture() -> None:
 
 def test_what_leaves_the_frame_is_not_followed() -> None:
     forward, _ = flow_between(
-        as_followed(frames(np.array([0.0, 25.0]))), np.array([[20.0, 120.0], [200.0, 120.0]]), np.zeros((0, 2))
+        as_followed(frames(np.array([0.0, 12.5, 25.0]))), np.array([[20.0, 120.0], [200.0, 120.0]]), np.zeros((0, 2))
     )
-    assert forward.point.tolist() == [1]
+    assert forward.point[forward.frame == 2].tolist() == [1]
+
+
+def test_what_a_slanted_plane_shows_is_where_it_is() -> None:
+    """Ground before a camera that comes nearer: windows that are only shifted are off to one side.
+
+    Their texture is finer, and has more weight, in the farther half.
+    """
+    K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
+    ground = cv2.GaussianBlur(texture(1600, 1200, 5, channels=1), (0, 0), 1.5)
+
+    def frame(ahead: float) -> np.ndarray:
+        # metres across and ahead of the ground, 1.2 m below, 80 texels a metre
+        to_ground = np.array([[80.0, 0, 800], [0, 80.0, 100], [0, 0, 1]])
+        to_pixels = K @ np.array([[1.0, 0, 0], [0, 0, 1.2], [0, 1.0, -ahead]])
+        # four samples a pixel
+        fine = np.diag([4.0, 4.0, 1.0]) @ [[1, 0, 0.375], [0, 1, 0.375], [0, 0, 1]]
+        shown = cv2.warpPerspective(ground, fine @ to_pixels @ np.linalg.inv(to_ground), (1280, 960))
+        return FlowFrame.of(cv2.resize(shown, (320, 240), interpolation=cv2.INTER_AREA))
+
+    xs, ys = np.meshgrid(np.arange(40.0, 281, 12), np.arange(170.0, 201, 6))
+    xy = np.column_stack([xs.ravel(), ys.ravel()])
+    forward, _ = flow_between([frame(each) for each in np.linspace(0.0, 0.4, 5)], xy, xy[:0])
+    mine = forward.frame == 4
+    found, start = forward.xy[mine], xy[forward.point[mine]]
+    depth = 300.0 * 1.2 / (start[:, 1] - 119.5)
+    there = (start - [159.5, 119.5]) * (depth / (depth - 0.4))[:, None] + [159.5, 119.5]
+    assert mine.sum() > 60
+    assert np.abs(np.median(found - there, axis=0)).max() < 0.03
 
 
 def test_key_frames_follow_the_motion_of_the_picture() -> None:

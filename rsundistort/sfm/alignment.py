@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
-from .._kernels.alignment import align
+from .._kernels.alignment import HALF, align
 from ..model import Observations, Reconstruction
 from ..model.array_types import Array, Index, Mask
 from ..model.projection import project_points
 from .features import SIFT_PX, size_of_sigma
 
-__all__ = ["PatchPlaces", "PatchSource", "align_tracks", "allowed_patches", "cut_patches"]
+__all__ = ["PatchPlaces", "PatchSource", "align_places", "align_tracks", "allowed_patches", "cut_patches"]
 
 # Half the side of the cut-outs: a window rotated by 45 degrees and stretched by a half, and room for the shift.
 _MARGIN = 24
@@ -101,6 +101,54 @@ def allowed_patches(mask: NDArray[np.uint8] | None, places: PatchPlaces) -> Mask
         - hidden[high[:, 1], low[:, 0]] + hidden[low[:, 1], low[:, 0]]
     )  # fmt: skip
     return np.asarray(inside == 0)
+
+
+def align_places(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    first_xy: Array,
+    second_xy: Array,
+    spacing: float,
+    most_px: float,
+) -> tuple[Array, Mask]:
+    """Where a grey photo shows what lies at places of another one, whose windows may be rotated, stretched and sheared.
+
+    A window that is only shifted ends up where the middle of its texture fits, which is not the place itself: what is
+    wrong then grows as the photos change, and all places of a slanted plane err alike.
+
+    Parameters
+    ----------
+    first_xy, second_xy : (n, 2) array
+        Places in the first, and about where they are in the second.
+    spacing : float
+        Pixels from sample to sample of the windows, which have 15 x 15.
+    most_px : float
+        How far the places in the second may be off.
+
+    Returns
+    -------
+    places : (n, 2) array
+        In the second.
+    found : (n,) bool array
+        Which of them are right: their windows lie inside both photos and are alike, and were no farther off.
+    """
+    n = len(first_xy)
+    at = np.asarray(np.concatenate([first_xy, second_xy]), np.float64)
+    corner = np.asarray(np.rint(at), np.int64) - _MARGIN
+    level = np.zeros(n, np.int64)
+    patches = np.concatenate([
+        cut_patches(photo, PatchPlaces(level, each)) for photo, each in ((first, corner[:n]), (second, corner[n:]))
+    ])  # fmt: skip
+    place, M = np.stack(np.split(at - corner, 2), 1), np.broadcast_to(spacing * np.eye(2), (n, 2, 2, 2)).copy()
+    centre, correlation, covariance = np.full((n, 2), np.nan), np.empty(n), np.empty((n, 2, 2))
+    align(patches, np.arange(n), n + np.arange(n), place, M, _LEAST_CONTRAST, centre, correlation, covariance)
+    places = centre + corner[n:]
+    # NaN is not believed
+    found = (correlation >= _LEAST_MEASURED) & (np.linalg.norm(places - second_xy, axis=1) <= most_px)
+    reach = HALF * spacing
+    for xy, photo in ((first_xy, first), (places, second)):
+        found &= np.all((xy >= reach) & (xy <= np.array(photo.shape[::-1]) - 1 - reach), axis=1)
+    return places, np.asarray(found)
 
 
 #: What reads photos: places by photo to (photo, patches, which of them its mask allows).
