@@ -143,7 +143,7 @@ def test_what_a_slanted_plane_shows_is_where_it_is() -> None:
 
     xs, ys = np.meshgrid(np.arange(40.0, 281, 12), np.arange(170.0, 201, 6))
     xy = np.column_stack([xs.ravel(), ys.ravel()])
-    forward, _ = flow_between([frame(each) for each in np.linspace(0.0, 0.4, 5)], xy, xy[:0])
+    forward, _ = flow_between([frame(float(each)) for each in np.linspace(0.0, 0.4, 5)], xy, xy[:0])
     mine = forward.frame == 4
     found, start = forward.xy[mine], xy[forward.point[mine]]
     depth = 300.0 * 1.2 / (start[:, 1] - 119.5)

@@ -104,13 +104,9 @@ def allowed_patches(mask: NDArray[np.uint8] | None, places: PatchPlaces) -> Mask
 
 
 def align_places(
-    first: NDArray[np.uint8],
-    second: NDArray[np.uint8],
-    first_xy: Array,
-    second_xy: Array,
-    spacing: float,
-    most_px: float,
-) -> tuple[Array, Mask]:
+    first: NDArray[np.uint8], second: NDArray[np.uint8], first_xy: Array, second_xy: Array,
+    spacing: float, most_px: float,
+) -> tuple[Array, Mask]:  # fmt: skip
     """Where a grey photo shows what lies at places of another one, whose windows may be rotated, stretched and sheared.
 
     A window that is only shifted ends up where the middle of its texture fits, which is not the place itself: what is
@@ -142,7 +138,7 @@ def align_places(
     place, M = np.stack(np.split(at - corner, 2), 1), np.broadcast_to(spacing * np.eye(2), (n, 2, 2, 2)).copy()
     centre, correlation, covariance = np.full((n, 2), np.nan), np.empty(n), np.empty((n, 2, 2))
     align(patches, np.arange(n), n + np.arange(n), place, M, _LEAST_CONTRAST, centre, correlation, covariance)
-    places = centre + corner[n:]
+    places = np.asarray(centre + corner[n:], np.float64)
     # NaN is not believed
     found = (correlation >= _LEAST_MEASURED) & (np.linalg.norm(places - second_xy, axis=1) <= most_px)
     reach = HALF * spacing

@@ -342,7 +342,8 @@ def _through(frames: Sequence[FlowFrame], key: int, order: Iterable[int], start:
     for k in order:
         xy, seen = _followed(frames[key], frames[k], xy0, xy, levels)
         index, xy0, xy = index[seen], xy0[seen], xy[seen]
-        places, alike = align_places(frames[key].grey, frames[k].grey, xy0, xy, _SPACING, _MOST_OFF)
+        both = xy0.astype(np.float64), xy.astype(np.float64)
+        places, alike = align_places(frames[key].grey, frames[k].grey, *both, _SPACING, _MOST_OFF)
         found.append((np.full(int(alike.sum()), k), index[alike], places[alike]))
     frame, point, places = (np.concatenate(each) for each in zip(*found, strict=True))
     return FlowTracks(frame.astype(np.int64), point.astype(np.int64), places)
