@@ -346,6 +346,26 @@ def test_no_vibration_is_tried_where_halves_tell_different_ones(rng):
     assert not any("vibrating" in label for label in choice.held_out_error)
 
 
+def test_a_vibration_is_found_that_bends_photos_by_many_pixels(rng):
+    """Other models leave so much of it that points of either half of the scene take up a part, each their own."""
+    truth = make_scene(rng, groups=0, num_points=1200)
+    camera, obs = truth.cameras[0], truth.observations
+    periods = rng.uniform(1.2, 1.5, truth.num_images)
+    shakes = [
+        bend_along(lambda p, k=k, n=n: 8e-3 * np.sin(2 * np.pi * n * p + k)[:, None] * [1, 0.7, 0.2], camera, 65)
+        for k, n in enumerate(periods)
+    ]
+    shaken = truth.with_motions([RowMotion(phi, bend=bend) for phi, bend in zip(truth.phi, shakes, strict=True)])
+    off, valid = reprojection_residuals(shaken)
+    measured = replace(
+        obs, xy_raw=obs.xy_raw + np.where(valid[:, None], off, 0) + NOISE_PX * rng.normal(size=off.shape)
+    )
+    start = bundle_adjust(still(replace(truth, observations=measured)), "rotation")
+    choice = choose_model(start.reconstruction, sigma_px=start.sigma_px)
+    assert choice.label == "rotation, vibrating"
+    assert choice.shutter == "found"
+
+
 def test_lines_that_move_faster_than_any_model_are_noticed(rng):
     truth = make_scene(rng, groups=0, num_points=1200)
     camera, obs = truth.cameras[0], truth.observations

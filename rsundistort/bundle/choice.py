@@ -115,10 +115,7 @@ class _Selection:
         for bends in BENDS:
             if bends <= fit.bends:
                 continue
-            # a vibration rotates the whole line: both halves of the scene show it
-            if (fit.is_explained or fit.bends >= SMOOTH_BENDS) and not (
-                self._fits.waves(fit) and self._fits.waves_agree(fit)
-            ):
+            if (fit.is_explained or fit.bends >= SMOOTH_BENDS) and not self._fits.shared_waves(fit):
                 return
             fit = self._fits.fit(fit.model, fit.varying, [fit.reconstruction], bends=bends)
             self.consider(fit)

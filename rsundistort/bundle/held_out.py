@@ -51,6 +51,9 @@ _VARYING = ", varying lens"
 # Unsteady motions, by the groups of bends that they have. A cubic that is free in each photo hides the height of the
 # scene, so a rate that changes steadily is tried without it.
 BENDS = {0: "", 1: ", accelerating", 2: ", bent", 5: ", vibrating"}
+# Least correlation of the waves that two halves of the scene show, if a vibration is to be among them: 0.8 of one of a
+# milliradian, and 0.4 of several, since points of either half take up a part; 0.02 to 0.14 of photos without one.
+_SHARED = 0.25
 # Groups that a smooth warp could imitate; the others displace lines faster.
 SMOOTH_BENDS = 2
 
@@ -250,7 +253,7 @@ class ModelFits:
         smooth = min(fit.bends, SMOOTH_BENDS)
         still = self.fit(plain.model, False, [self.given])
         other = read([read_along_other_axis(each.reconstruction) for each in (plain, still)], smooth)
-        if fit.bends > smooth and self.waves_agree(other):
+        if fit.bends > smooth and self.shared_waves(other):
             other = read([other.reconstruction], fit.bends)
         return other
 
@@ -307,19 +310,27 @@ class ModelFits:
 
         And by more than `least_px`, root mean square.
         """
-        if not len(self.held_out):
+        fall = self._fall_by_waves(fit, sites)
+        return fall > MIN_FALL * float(fit.errors.mean()) and fall > (least_px / self._sigma_px) ** 2 / 2
+
+    def shared_waves(self, fit: ModelFit) -> bool:
+        """Whether the part of them that two halves of the scene share would: a vibration rotates whole lines."""
+        fall, least = self._fall_by_waves(fit, WAVES), MIN_FALL * float(fit.errors.mean())
+        if fall <= least:
             return False
+        shared = agreement_of_waves(fit.reconstruction, self._sigma_px)
+        return shared > _SHARED and shared * fall > least
+
+    def _fall_by_waves(self, fit: ModelFit, sites: int) -> float:
+        """Fall of the held-out error by splines along the readout of each photo, beyond that by a smooth warp of it."""
+        if not len(self.held_out):
+            return 0.0
         seen = self.given.observations
         smooth, free = (
             errors_without(functions, fit.reconstruction, seen, self.held_out, self._sigma_px).mean()
             for functions in (warps, partial(waves, sites=sites))
         )
-        fall = float(smooth - free)
-        return fall > MIN_FALL * float(fit.errors.mean()) and fall > (least_px / self._sigma_px) ** 2 / 2
-
-    def waves_agree(self, fit: ModelFit) -> bool:
-        """Whether two halves of the scene show the same motions of the lines."""
-        return agreement_of_waves(fit.reconstruction, self._sigma_px) >= MIN_AGREEMENT
+        return float(smooth - free)
 
     def at_limit(self, fit: ModelFit) -> bool:
         """Whether the motions reach the limit that is known from elsewhere."""
