@@ -21,6 +21,7 @@ from rsundistort.io import (
     facts_of_exif,
     focal_from_exif,
     group_of,
+    groups_of,
     guess_readouts,
     read_exif,
 )
@@ -475,6 +476,15 @@ def test_real_photos_are_one_group(folder, num, label):
 )  # fmt: skip
 def test_labels(facts, label):
     assert group_of(facts, 640, 480) == label
+
+
+def test_a_zoom_that_only_the_35_mm_equivalent_tells_is_another_group():
+    """Photos without one, or with one that is rounded otherwise, are of the shortest."""
+    of_35 = [26, 39, 27, None, 52, 39]
+    facts = [replace(PHONE, focal_35mm=each) for each in of_35]
+    usual = "apple-iphone-6-4.15mm-640x480"
+    zoomed = ["apple-iphone-6-4.15mm-39mm-of-35-640x480", "apple-iphone-6-4.15mm-52mm-of-35-640x480"]
+    assert groups_of(facts, [(640, 480)] * 6) == [usual, zoomed[0], usual, usual, zoomed[1], zoomed[0]]
 
 
 # ---------------------------------------------------------------- readouts

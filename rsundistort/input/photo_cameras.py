@@ -12,7 +12,7 @@ import numpy as np
 from ..bundle import BundleOptions, GuessedCameras, deviation, pixels_of
 from ..bundle.intrinsics import check_lenses
 from ..errors import InputError, ReconstructionError
-from ..io import CameraFile, ExifFacts, camera_from_exif, check_camera_fits, group_of, guess_readouts, read_camera_file
+from ..io import CameraFile, ExifFacts, camera_from_exif, check_camera_fits, groups_of, guess_readouts, read_camera_file
 from ..model import Camera, check_readout
 from ..model.array_types import Index
 from ..sfm import USUAL_FOCAL
@@ -210,7 +210,7 @@ def find_cameras(
     InputError
         A photo has no camera, or one of another size.
     """
-    groups = [group_of(fact, *size) for fact, size in zip(facts, sizes, strict=True)]
+    groups = groups_of(facts, sizes)
     if camera is None and (beside := camera_file_of(folder, None)) is not None:
         camera = str(beside)
     if camera is not None:

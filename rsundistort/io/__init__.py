@@ -4,7 +4,7 @@ from ..colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model,
 from .cameras import CameraFile, check_camera_fits, read_camera_file
 from .depth_maps import find_depth_maps, read_depth_map
 from .gpmf import has_telemetry, read_gpmf
-from .groups import group_of, guess_readouts
+from .groups import group_of, groups_of, guess_readouts
 from .gyro import GyroLog, bends_from_gyro, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
 from .masks import find_masks, read_mask
 from .motions import read_known_motions
@@ -40,6 +40,7 @@ __all__ = [
     "find_masks",
     "focal_from_exif",
     "group_of",
+    "groups_of",
     "guess_readouts",
     "gyro_offset",
     "has_telemetry",

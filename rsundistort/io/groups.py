@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from ..model import other_axis
 from .photos.exif_facts import ExifFacts
 
-__all__ = ["group_of", "guess_readouts"]
+__all__ = ["group_of", "groups_of", "guess_readouts"]
+
+# 35-mm equivalents that differ by more than this share are of another zoom: EXIF has them in whole millimetres.
+_ZOOMED = 0.05
 
 
 def group_of(facts: ExifFacts, width: int, height: int) -> str:
@@ -22,6 +25,25 @@ def group_of(facts: ExifFacts, width: int, height: int) -> str:
     'camera-3264x2448'
     """
     return f"{_body(facts)}-{width}x{height}"
+
+
+def groups_of(facts: Sequence[ExifFacts], sizes: Sequence[tuple[int, int]]) -> list[str]:
+    """The label of each photo of a folder.
+
+    As `group_of` has it, but for photos that were zoomed digitally: some programs write that into the 35-mm equivalent
+    alone, which then differs between photos of one focal length. The shortest has the usual label.
+    """
+    labels = [group_of(fact, *size) for fact, size in zip(facts, sizes, strict=True)]
+    wide = dict[str, float]()
+    for fact, label in zip(facts, labels, strict=True):
+        if fact.focal_35mm:
+            wide[label] = min(fact.focal_35mm, wide.get(label, fact.focal_35mm))
+    return [
+        f"{_body(fact)}-{fact.focal_35mm:.4g}mm-of-35-{size[0]}x{size[1]}"
+        if fact.focal_35mm and fact.focal_35mm > (1 + _ZOOMED) * wide[label]
+        else label
+        for fact, size, label in zip(facts, sizes, labels, strict=True)
+    ]
 
 
 def _body(facts: ExifFacts) -> str:
