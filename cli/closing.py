@@ -97,7 +97,7 @@ def closing_table(solution: Solution, out: Path) -> str:
     if critical.get("flagged") and not all(image.lens_only for image in solution.registered):
         # the same but for its capital
         said += [critical["sentence"]] * (critical["sentence"][1:] not in said[0])
-        said += ["at the next shoot:", *critical["advice"]] if critical["advice"] else []
+        said += ["At the next shoot:", *critical["advice"]] if critical["advice"] else []
     lines += ["", *(line for text in said for line in textwrap.wrap(text, _COLUMNS))]
     doubtful = [image for image in solution.registered if image.doubtful]
     if doubtful:

@@ -119,7 +119,7 @@ def test_closing_table_fits_80_columns():
         solution(names, advice=["Take a photo rotated by 90 degrees about the line of sight " * 3]), Path("out")
     )
     assert max(len(line) for line in text.splitlines()) <= 80
-    for said in ("3 of 4", "constant-motion", "lost.jpg", "at the next shoot", "f 3000.0 +- 1.0"):
+    for said in ("3 of 4", "constant-motion", "lost.jpg", "At the next shoot", "f 3000.0 +- 1.0"):
         assert said in text
 
 

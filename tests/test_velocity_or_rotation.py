@@ -18,6 +18,7 @@ from rsundistort.bundle.doubt import steps_after, steps_to
 from rsundistort.bundle.held_out import ModelFits
 from rsundistort.bundle.model_choice import LEAST_RIVAL
 from rsundistort.model.reprojection import shutter_displacements
+from rsundistort.model.zooms import zooms
 from rsundistort.solve.model_sequence import _is_common
 from rsundistort.verdict.judge import _rival_reasons
 
@@ -95,6 +96,16 @@ def test_a_lens_that_focuses_is_seen_beside_a_camera_that_travels(rng, share):
     assert choice.label == "constant-motion" + ", varying lens" * (share > 0)
 
 
+def test_photos_of_another_zoom_are_noticed(rng):
+    rec = flight(rng, 8, drift=0.0, rotation=0.01, relief=20.0)
+    obs, center = rec.observations, rec.cameras[0].K[:2, 2]
+    scale = np.where(np.arange(8) % 3 == 2, 1.1, 1.0)[obs.frame_idx, None]
+    choice = choose_lens(replace(rec, observations=replace(obs, xy_raw=center + scale * (obs.xy_raw - center))))
+    assert choice.varying
+    focal_px = [choice.focal_px[name] for name in rec.image_names]
+    assert [sorted(part.tolist()) for part in zooms(focal_px)] == [[0, 1, 3, 4, 6, 7], [2, 5]]
+
+
 def test_a_velocity_and_a_lens_that_varies_are_both_kept_where_neither_predicts_better(rng):
     rec = at_rest(flight(rng, 8, drift=0.1, rotation=0.01, relief=20.0))
     fits = ModelFits(rec, BundleOptions(), NOISE_PX, 0, None)
@@ -123,19 +134,22 @@ def test_a_rival_of_another_lens_is_tried_with_the_same_one(rng):
     fits, gain = ModelFits(rec, BundleOptions(), NOISE_PX, 0, None), dict[str, float]()
     best = fits.fit("rotation", False, [fits.given])
     # no velocity was tried, so nothing is a rival
-    assert _rival(fits, best, gain) == 0.0
+    assert _rival(fits, best, gain) == (0.0, 0.0)
     assert list(fits.done) == ["rotation"]
     fits.fit("constant-motion", True, [best.reconstruction])
-    assert _rival(fits, best, gain) > LEAST_RIVAL
+    assert _rival(fits, best, gain)[0] > LEAST_RIVAL
     assert list(fits.done) == ["rotation", "constant-motion, varying lens", "constant-motion"]
     assert gain == {"constant-motion": fits.gain(best, fits.done["constant-motion"])}
 
 
 def test_a_rival_is_a_reason_that_says_what_to_give(rng):
-    choice = replace(choose(flight(rng, 5, drift=0.0, rotation=0.03)), rival=1.9)
+    choice = replace(choose(flight(rng, 5, drift=0.0, rotation=0.03)), rival=1.9, rival_px=0.6)
     (said,) = _rival_reasons(choice)
     assert "1.9 times" in said
     assert "--model constant-motion" in said
+    # the evidence decides about what nobody would see, without a word
+    assert replace(choice, rival_px=0.4).has_rival
+    assert not _rival_reasons(replace(choice, rival_px=0.4))
 
 
 @pytest.mark.parametrize(("drift", "rotation"), [(0.5, 0.003), (0.0, 0.03)])

@@ -15,7 +15,7 @@ from .bundle_options import BundleOptions
 from .doubt import steps_to
 from .held_out import BENDS, MIN_AGREEMENT, MIN_FALL, SMOOTH_BENDS, ModelFit, ModelFits
 from .known_motions import compare_known_motions
-from .model_choice import LEAST_RIVAL, ModelChoice
+from .model_choice import LEAST_RIVAL, UNSEEN_PX, ModelChoice
 
 __all__ = ["choose_model"]
 
@@ -23,8 +23,8 @@ __all__ = ["choose_model"]
 _MOST_OF_IT = 0.5
 # Splines along the readout through this many values follow motions that none of the models can.
 _RESTLESS = 49
-# Motions that displace pixels by less than this, root mean square over the photos, count as none.
-_UNSEEN_PX = 0.5
+# A velocity that displaces pixels otherwise by less than this on average is not asked about: none could be seen.
+_LEAST_APART = 0.1
 _FIELD = ", residual field"
 
 
@@ -162,7 +162,7 @@ def choose_model(
     against, agreement = selection.against if best is plain else [], None
     known = compare_known_motions(fits, plain, best)
     if best is not plain:
-        if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < _UNSEEN_PX:
+        if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < UNSEEN_PX:
             best = plain
         else:
             # what else bends photos knows nothing of motions that were measured elsewhere
@@ -179,7 +179,9 @@ def choose_model(
         kept = kept[: kept.index(best.label) + 1]
     if options.refine:
         best = _with_field(fits, best, kept, gain)
-    rival = _rival(fits, best, gain)
+    # a lens that varies too much is not kept where no shutter was found, but says why
+    zooming = best if shutter == "found" else plain
+    rival, rival_px = _rival(fits, best, gain)
     return ModelChoice(
         best.model,
         best.label,
@@ -195,11 +197,18 @@ def choose_model(
         len(fits.held_out),
         best.residual_field,
         best.bends,
-        shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
+        shutter != "not-determined" and fits.waves(best, _RESTLESS, UNSEEN_PX / 2),
         rival,
         _steps_of_others(fits, best),
         known,
+        rival_px=rival_px,
+        focal_px=_focal_lengths(zooming.reconstruction) if zooming.varying else {},
     )
+
+
+def _focal_lengths(rec: Reconstruction) -> dict[str, float]:
+    """Focal lengths of the photos, pixels."""
+    return {name: float(rec.camera(i).K[0, 0]) for i, name in enumerate(rec.image_names)}
 
 
 def _with_field(fits: ModelFits, best: ModelFit, kept: list[str], gain: dict[str, float]) -> ModelFit:
@@ -231,26 +240,26 @@ def _steps_of_others(fits: ModelFits, best: ModelFit) -> dict[str, tuple[float, 
     return {name: tuple(each) for name, each in zip(rec.image_names, most.tolist(), strict=True)}
 
 
-def _rival(fits: ModelFits, best: ModelFit, gain: dict[str, float]) -> float:
-    """`ModelChoice.rival`, the most of the velocities that were tried; with the lens of the best, if there is one."""
+def _rival(fits: ModelFits, best: ModelFit, gain: dict[str, float]) -> tuple[float, float]:
+    """`ModelChoice.rival` and `rival_px`, the most of the velocities that were tried; with the lens of the best."""
     if best.model != "rotation":
-        return 0.0
+        return 0.0, 0.0
     found = _rival_of_tried(fits, best)
-    if found >= LEAST_RIVAL and not best.residual_field:
+    if found[0] >= LEAST_RIVAL and not best.residual_field:
         velocity = fits.fit("constant-motion", best.varying, [best.reconstruction])
         gain.setdefault(velocity.label, fits.gain(best, velocity))
         found = _rival_of_tried(fits, best)
     return found
 
 
-def _rival_of_tried(fits: ModelFits, best: ModelFit) -> float:
+def _rival_of_tried(fits: ModelFits, best: ModelFit) -> tuple[float, float]:
     """`_rival` of the models that were fitted."""
-    shares, (own, seen) = [0.0], shutter_displacements(best.reconstruction)
+    shares, (own, seen) = [(0.0, 0.0)], shutter_displacements(best.reconstruction)
     for fit in fits.done.values():
         if fit.model == "constant-motion" and not fits.is_better(fit, best):
             other, valid = shutter_displacements(fit.reconstruction)
             apart, size = (typical_px(best.reconstruction, each, seen & valid) for each in (other - own, own))
-            shares.append(float(apart / max(size, 1e-9)) if apart >= _UNSEEN_PX else 0.0)
+            shares.append((float(apart / max(size, 1e-9)), float(apart)) if apart >= _LEAST_APART else (0.0, 0.0))
     return max(shares)
 
 

@@ -10,10 +10,12 @@ import numpy as np
 from .held_out import BENDS
 from .known_motions import KnownMotions
 
-__all__ = ["LEAST_RIVAL", "ModelChoice"]
+__all__ = ["LEAST_RIVAL", "UNSEEN_PX", "ModelChoice"]
 
 #: Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
 LEAST_RIVAL = 1 / 3
+#: Displacements below this, root mean square or mean over the photos, are not taken out of photos nor spoken of.
+UNSEEN_PX = 0.5
 # Mean error of held-out measurements, 1 for noise alone, and pixels beyond it, that noise does not explain.
 _NOT_NOISE, _HELD_OUT_PX = 2.0, 0.5
 
@@ -61,13 +63,18 @@ class ModelChoice:
     rival : float
         Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
         otherwise (the mean over the photos of their medians) over what the rotations displace them by. 0 where no
-        velocity does as well, and where that is less than half a pixel.
+        velocity does as well, and where that is less than a tenth of a pixel.
+    rival_px : float
+        By how much, in pixels.
     steps : mapping of photo to 12 floats
         Of a shutter: how far the other model that moves its motions most would move them, as `BundleOptions.rival`.
     known_motions : KnownMotions or None
         What the photos say of motions that are known from elsewhere; None if none are.
     is_shared : bool
         Whether a velocity was kept since photos share it, which held-out measurements do not show.
+    focal_px : mapping of photo to float
+        Focal lengths of the photos where the lens varies; also where that explains much, but no shutter was found, and
+        it is not kept. {} where it does not.
     """
 
     shutter_model: str
@@ -89,11 +96,18 @@ class ModelChoice:
     steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     known_motions: KnownMotions | None = None
     is_shared: bool = False
+    rival_px: float = 0.0
+    focal_px: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def has_rival(self) -> bool:
         """Whether a velocity explains the photos as well, and displaces them otherwise."""
         return self.rival >= LEAST_RIVAL
+
+    @property
+    def shows_rival(self) -> bool:
+        """Whether that can be seen."""
+        return self.has_rival and self.rival_px >= UNSEEN_PX
 
     def unexplained_px(self, sigma_px: float) -> float:
         """How far held-out measurements are off beyond their noise; 0 if by little more than noise, or half a pixel."""
@@ -114,6 +128,7 @@ class ModelChoice:
             bends=0,
             kept=(*self.kept, label),
             rival=0.0,
+            rival_px=0.0,
             steps={},
             is_shared=True,
         )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
 from ..bundle.intrinsics import check_lenses
-from ..errors import FileError, InputError, RsUndistortWarning
+from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_readouts
@@ -21,6 +22,7 @@ from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos, OtherFeatures, load_photos
 from ..input.photo_cameras import camera_file_of
 from ..input.unknown_focal import warn_of_weak_focal_lengths, with_focal_lengths
+from ..input.zooms import cameras_by_zoom
 from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
@@ -54,6 +56,9 @@ from .tracks import of_registered
 from .video_path import frame_path, solve_clip
 
 __all__ = ["check_of_video", "run", "solve_frames"]
+
+# Times that photos are solved again after some of them seem to have another zoom.
+_ZOOM_ROUNDS = 2
 
 
 def run(
@@ -176,7 +181,8 @@ def _solved(
     check_lenses([*options.solve.camera_sigma], loaded.cameras.cameras, "camera_sigma:")
     bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
     if source.clip is None:
-        solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log, kept)
+        solve = partial(_solve, options, bodies=bodies, gyro_log=gyro_log, workers=workers, log=log)
+        solved, solving, loaded = _by_zoom(solve, loaded, kept)
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
     rec, sigmas = solved.result.reconstruction, solved.result.sigma_intrinsics
@@ -204,6 +210,63 @@ def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) ->
     for name in (*options.still, *options.known, *ends):
         if name not in names:
             raise InputError(f"constraint on {name!r}, which is not among the photos of {photos}")
+
+
+def _by_zoom(
+    solve: Callable[..., tuple[Solved, SolveOptions]], loaded: LoadedPhotos, kept: Kept
+) -> tuple[Solved, SolveOptions, LoadedPhotos]:
+    """The result of the photos; by cameras of their own for those that seem to have another zoom, if it fits better."""
+    with _saying() as said:
+        solved, solving = solve(loaded, kept=kept)
+        for _ in range(_ZOOM_ROUNDS):
+            apart = cameras_by_zoom(loaded.cameras, loaded.names, _zooms(solved))
+            if apart is None:
+                break
+            cameras, notes = apart
+            divided, before = replace(loaded, cameras=cameras), [*said]
+            said.clear()
+            other = None
+            # what was mapped before has other cameras: it is not kept
+            with suppress(ReconstructionError, InputError):
+                other, solving_then = solve(divided, kept=Kept())
+            if other is None or not _is_better(other, solved):
+                said[:] = before
+                break
+            solved, solving, loaded = other, solving_then, divided
+            for note in notes:
+                warnings.warn(note, RsUndistortWarning, stacklevel=4)
+    return solved, solving, loaded
+
+
+def _zooms(solved: Solved) -> Mapping[str, float]:
+    """Focal lengths of photos in pixels where the lens varies, if it does or would explain much; else {}."""
+    rec, choice = solved.shared, solved.choice
+    if choice is None or not choice.focal_px:
+        return {}
+    # the last adjustment, of all measurements, knows them better
+    known = {name: float(rec.camera(i).K[0, 0]) for i, name in enumerate(rec.image_names)}
+    return known if choice.varying else choice.focal_px
+
+
+@contextmanager
+def _saying() -> Iterator[list[warnings.WarningMessage]]:
+    """Hold back warnings; those that are left in the list are given in the end, or before an error.
+
+    What is said of a solution that is not taken concerns nobody.
+    """
+    said: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as said:
+            yield said
+    finally:
+        for each in said:
+            warnings.warn(each.message, each.category, stacklevel=6)
+
+
+def _is_better(other: Solved, before: Solved) -> bool:
+    """Whether a solution leaves less of as many photos."""
+    fewer = len(other.shared.image_names) < len(before.shared.image_names)
+    return not fewer and other.result.sigma_px < before.result.sigma_px
 
 
 def _solve(

@@ -17,6 +17,7 @@ from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 from ..model.field import excess_px
+from ..model.zooms import zooms
 from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, hidden_px, photo_motions
 from .residuals import left_along_readout, left_over_frame
@@ -249,6 +250,11 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
                 "The lines of the photos move faster than the motions that are modelled: the camera shook at more than "
                 "five periods a frame, or the photos were stabilised line by line."
             )
+        if zoomed := _zoomed(result.reconstruction):
+            reasons.append(
+                f"The focal length would have to vary more than by focusing, {zoomed}: photos of another zoom, or of "
+                "another camera, are among these; give them a camera of their own (cameras.json)."
+            )
         if (beyond_px := choice.unexplained_px(result.sigma_px)) > 0:
             reasons.append(
                 f"Held-out measurements are off by {beyond_px:.1f} px more than their noise explains; exclude what "
@@ -257,9 +263,18 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
     return reasons
 
 
+def _zoomed(rec: Reconstruction) -> str:
+    """From where to where focal lengths of a camera vary, if they lie too far apart for one that focuses; else ""."""
+    for k in range(len(rec.cameras)):
+        focal = np.array([rec.camera(i).K[0, 0] for i in np.flatnonzero(rec.camera_idx == k).tolist()])
+        if len(zooms(focal)) > 1:
+            return f"from {focal.min():.0f} to {focal.max():.0f} px"
+    return ""
+
+
 def _rival_reasons(choice: ModelChoice | None) -> list[str]:
     """Whether the photos may have been displaced by a velocity, and not by the rotations that were found."""
-    if choice is None or not choice.has_rival:
+    if choice is None or not choice.shows_rival:
         return []
     return [
         "A camera that travels explains the photos as well as one that rotates, and would displace pixels elsewhere, "
