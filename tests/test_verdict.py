@@ -25,7 +25,7 @@ from rsundistort.critical import heal
 from rsundistort.rectify import largest_shift_px
 from rsundistort.solve.model_sequence import _lens_instead
 from rsundistort.verdict import Verdict, judge
-from rsundistort.verdict.judge import _repeated
+from rsundistort.verdict.judge import _no_parallax, _repeated, _zoomed
 from rsundistort.verdict.photos import photo_motions
 from rsundistort.verdict.residuals import left_along_readout, left_over_frame
 
@@ -521,3 +521,19 @@ def test_a_lens_that_photos_in_contradiction_need_is_not_corrected(model, error,
         odd = SimpleNamespace(cameras=[replace(CAMERA, K=CAMERA.K * [[2, 1, 1], [1, 2, 1], [1, 1, 1]])])
         why = _lens_instead(choice_of(model, 9.0), found, odd, guessed)[1]
         assert "contradict each other" in why
+
+
+def test_photos_from_one_spot_that_may_be_misplaced_are_told_to_walk(rng):
+    rec = measured(rng, swung(rng), noise_px=0.1)
+    assert not _no_parallax(rec)
+    near = replace(rec, center_w=rec.center_w[0] + 0.005 * rng.normal(size=rec.center_w.shape))
+    (said,) = _no_parallax(near)
+    assert "walk between photos" in said
+
+
+def test_a_lens_that_zoomed_is_no_lens_that_focuses(rng):
+    rec = measured(rng, swung(rng), noise_px=0.1)
+    focused, zoomed = np.zeros((8, 3)), np.zeros((8, 3))
+    focused[:, 0], zoomed[2:4, 0] = rng.normal(0, 0.005, 8), 0.1
+    assert not _zoomed(replace(rec, variation=focused))
+    assert _zoomed(replace(rec, variation=zoomed)) == "from 700 to 774 px"

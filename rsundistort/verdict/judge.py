@@ -58,6 +58,9 @@ _NO_LENS = 0.01
 _LOST_DEG = 1.0
 # Said of a photo that may have a wrong place.
 _SUSPECT = "its matches with the other photos contradict its place"
+# Distance of a photo from the nearest other one, over the depth of what it shows, below which depths are hardly known:
+# photos that were taken walking have 0.05 and more.
+_NO_PARALLAX = 0.01
 # Cosine between axes of rotation that count as the same.
 _SAME_WAY = 0.9
 
@@ -137,6 +140,7 @@ def judge(
     reasons = loose_reasons(result, scaled) + height_reasons(remedy) + unexplained
     if suspects:
         reasons.append(f"{len(suspects)} of {rec.num_images} photos may have a wrong place ({', '.join(suspects)}).")
+        reasons += _no_parallax(rec)
     if rec.shutter_model == "global":
         shutter, why = _of_global(result, choice, options)
         misplaced = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
@@ -261,6 +265,18 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
                 "moves, if it is large (--masks)."
             )
     return reasons
+
+
+def _no_parallax(rec: Reconstruction) -> list[str]:
+    """Whether photos were taken so near to each other that hardly any depth is known."""
+    apart = np.linalg.norm(rec.center_w[:, None] - rec.center_w, axis=2) + np.diag(np.full(rec.num_images, np.inf))
+    share = float(np.median(apart.min(axis=1)) / rec.typical_depth)
+    if not share < _NO_PARALLAX:
+        return []
+    return [
+        f"Most photos were taken nearly from where another one was ({100 * share:.1f} % of the depth apart), so that "
+        "their depths are hardly known: walk between photos."
+    ]
 
 
 def _zoomed(rec: Reconstruction) -> str:
