@@ -55,6 +55,16 @@ def test_a_camera_that_is_divided_keeps_what_was_said_of_it():
     assert found[0].without_focal == [1, 2]
 
 
+def test_a_single_photo_goes_to_the_camera_that_was_divided_off_before():
+    divided, _ = cameras_by_zoom(cameras(), NAMES, by_name(690, 900, 695, 700, 700, 910, 700, 705)) or (None, None)
+    assert divided is not None
+    again = cameras_by_zoom(divided, NAMES, by_name(690, 900, 695, 700, 980, 910, 700, 705))
+    assert again is not None
+    assert again[0].camera_idx.tolist() == [0, 2, 0, 0, 2, 2, 1, 1]
+    assert again[0].labels == divided.labels
+    assert "1 of 4 photos of a has another focal length" in again[1][0]
+
+
 @pytest.mark.parametrize(
     "focal_px",
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from .photo_cameras import GUESS_SIGMA, PhotoCameras
 
 __all__ = ["cameras_by_zoom"]
 
-# Photos of one focal length, at least: a single one may as well be misplaced.
+# Photos of a focal length that no other camera has, at least: a single one may as well be misplaced.
 _LEAST = 2
 
 
@@ -43,25 +44,29 @@ def cameras_by_zoom(
     sigma, notes = [dict(each) for each in cameras.sigma or [{}] * len(found)], list[str]()
     for k in range(len(cameras.cameras)):
         mine = np.flatnonzero((cameras.camera_idx == k) & np.isfinite(values))
-        parts = [mine[part] for part in zooms(values[mine]) if len(part) >= _LEAST]
-        if len(parts) < 2:
-            continue
-        parts.sort(key=len, reverse=True)
-        usual = float(np.median(values[parts[0]]))
-        for n, part in enumerate(parts):
-            focal = float(np.median(values[part]))
-            if n == 0:
-                found[k] = _with_focal(found[k], focal)
+        most, *others = sorted((mine[part] for part in zooms(values[mine])), key=len, reverse=True) or [mine]
+        alike = [j for j, label in enumerate(cameras.labels) if j != k and _origin(label) == _origin(labels[k])]
+        for part in others:
+            usual, focal = (float(np.median(values[each])) for each in (most, part))
+            apart = {j: abs(np.log(focal / cameras.cameras[j].K[0, 0])) for j in alike}
+            nearest = min(apart, key=apart.__getitem__, default=k)
+            is_known = nearest != k and apart[nearest] < abs(np.log(focal / usual))
+            if is_known:
+                camera_idx[part] = nearest
+            elif len(part) < _LEAST:
                 continue
-            camera_idx[part] = len(found)
-            divided.append(k)
-            found.append(_with_focal(cameras.cameras[k], focal))
-            labels.append(f"{labels[k]}-f{focal:.0f}")
-            sigma.append(dict(GUESS_SIGMA) if cameras.calibrated else {})
+            else:
+                camera_idx[part] = len(found)
+                divided.append(k)
+                found.append(_with_focal(cameras.cameras[k], focal))
+                labels.append(f"{labels[k]}-f{focal:.0f}")
+                sigma.append(dict(GUESS_SIGMA) if cameras.calibrated else {})
+            found[k] = _with_focal(cameras.cameras[k], usual)
+            have = f"{len(part)} of {len(mine)} photos of {labels[k]} {'has' if len(part) == 1 else 'have'}"
             notes.append(
-                f"{len(part)} of {len(mine)} photos of {labels[k]} have another focal length than the others, of about "
-                f"{focal:.0f} px in place of {usual:.0f} ({', '.join(names[i] for i in sorted(part.tolist()))}): "
-                "another zoom, or another camera; they are solved as those of another one"
+                f"{have} another focal length than the others, of about {focal:.0f} px in place of {usual:.0f} "
+                f"({', '.join(names[i] for i in sorted(part.tolist()))}): another zoom, or another camera; solved as "
+                "of another one"
             )
     if not notes:
         return None
@@ -70,6 +75,11 @@ def cameras_by_zoom(
         readout_specified=tuple(cameras.readout_specified[k] for k in divided),
         without_focal=[k for k, old in enumerate(divided) if old in cameras.without_focal],
     ), notes  # fmt: skip
+
+
+def _origin(label: str) -> str:
+    """The label of the camera that one was divided from, or its own."""
+    return re.sub(r"(-f\d+)+$", "", label)
 
 
 def _with_focal(camera: Camera, focal_px: float) -> Camera:

@@ -58,7 +58,7 @@ from .video_path import frame_path, solve_clip
 __all__ = ["check_of_video", "run", "solve_frames"]
 
 # Times that photos are solved again after some of them seem to have another zoom.
-_ZOOM_ROUNDS = 2
+_ZOOM_ROUNDS = 3
 
 
 def run(
