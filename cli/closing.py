@@ -101,7 +101,9 @@ def closing_table(solution: Solution, out: Path) -> str:
     lines += ["", *(line for text in said for line in textwrap.wrap(text, _COLUMNS))]
     doubtful = [image for image in solution.registered if image.doubtful]
     if doubtful:
-        lines += ["", "doubtful (check these, or leave them out):"]
+        # most of the photos cannot be left out
+        few = 2 * len(doubtful) <= len(solution.registered)
+        lines += ["", f"doubtful (check these{', or leave them out' * few}):"]
         lines += [f"  {image.name}: {image.doubtful}" for image in doubtful]
     lens_only = [image.name for image in solution.registered if image.lens_only]
     if lens_only:
