@@ -183,27 +183,15 @@ def choose_model(
     zooming = best if shutter == "found" else plain
     rival, rival_px = _rival(fits, best, gain)
     return ModelChoice(
-        best.model,
-        best.label,
-        best.varying,
-        shutter,
+        best.model, best.label, best.varying, shutter,
         {label: float(fit.errors.mean()) if len(fit.errors) else float("nan") for label, fit in fits.done.items()},
-        {label: fit.rms_px for label, fit in fits.done.items()},
-        gain,
-        {label: fit.left for label, fit in fits.done.items()},
-        tuple(kept),
-        agreement,
-        tuple(against),
-        len(fits.held_out),
-        best.residual_field,
-        best.bends,
-        shutter != "not-determined" and fits.waves(best, _RESTLESS, UNSEEN_PX / 2),
-        rival,
-        _steps_of_others(fits, best),
-        known,
-        rival_px=rival_px,
+        {label: fit.rms_px for label, fit in fits.done.items()}, gain,
+        {label: fit.left for label, fit in fits.done.items()}, tuple(kept), agreement, tuple(against),
+        len(fits.held_out), best.residual_field, best.bends,
+        shutter != "not-determined" and fits.waves(best, _RESTLESS, UNSEEN_PX / 2), rival,
+        _steps_of_others(fits, best), known, rival_px=rival_px,
         focal_px=_focal_lengths(zooming.reconstruction) if zooming.varying else {},
-    )
+    )  # fmt: skip
 
 
 def _focal_lengths(rec: Reconstruction) -> dict[str, float]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..model import Camera
-from ..model.zooms import zooms
+from ..model.focal_lengths import zooms
 from .photo_cameras import GUESS_SIGMA, PhotoCameras
 
 __all__ = ["cameras_by_zoom"]

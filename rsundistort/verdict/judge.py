@@ -17,7 +17,7 @@ from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 from ..model.field import excess_px
-from ..model.zooms import zooms
+from ..model.focal_lengths import zooms
 from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, hidden_px, photo_motions
 from .residuals import left_along_readout, left_over_frame
