@@ -17,8 +17,8 @@ from rsundistort.bundle.choice import _rival, _Selection
 from rsundistort.bundle.doubt import steps_after, steps_to
 from rsundistort.bundle.held_out import ModelFits
 from rsundistort.bundle.model_choice import LEAST_RIVAL
-from rsundistort.model.reprojection import shutter_displacements
 from rsundistort.model.focal_lengths import zooms
+from rsundistort.model.reprojection import shutter_displacements
 from rsundistort.solve.model_sequence import _is_common
 from rsundistort.verdict.judge import _rival_reasons
 
