@@ -180,8 +180,12 @@ def _lens(solution: Solution) -> Iterator[tuple[str, str]]:
         (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
         values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **camera.coefficients}
         found = [_with_sigma(name, values[name], sigma) for name, sigma in sigmas.items()]
-        for i in range(0, len(found), 3):
-            yield _GOES_ON if i else "refined", ", ".join(found[i : i + 3])
+        told = [", ".join(found[i : i + 3]) for i in range(0, len(found), 3)]
+        mine = [image.name for image in solution.registered if image.camera_id in keys]
+        if told and mine and len(solution.shared_cameras) > 1:
+            others = {0: "", 1: " and 1 other"}.get(len(mine) - 1, f" and {len(mine) - 1} others")
+            told = [f"of {mine[0]}{others}:", *told]
+        yield from (("refined" if not i else _GOES_ON, each) for i, each in enumerate(told))
     if solution.lens_varied:
         focal, centre = quality["focal_sigma"], quality["centre_sigma_focal_lengths"]
         if centre:

@@ -8,6 +8,7 @@ import pty
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,17 @@ def test_closing_table_tells_what_the_model_was_chosen_by():
         "held-out error global 12.345, two-step 1.234 (better by 123.5 standard errors), rotation 1.230 "
         "(better by 1.2: not kept), constant-motion 1.350 (worse by 4.5: not kept) camera"
     ) in " ".join(closing_table(solution(["0001.jpg"]), Path("out")).split())
+
+
+def test_closing_table_says_whose_lens_it_is_where_there_are_several():
+    one = solution(["a.jpg", "b.jpg", "c.jpg"])
+    assert " of a.jpg" not in closing_table(one, Path("out"))
+    other = replace(one.cameras["1"], K=np.diag([2000.0, 2000.0, 1.0]))
+    images = [replace(each, camera_id="2") if each.name == "c.jpg" else each for each in one.images]
+    quality = one.quality | {"sigma_intrinsics": {key: {"f": 1.0} for key in "12"}, "readout_times": {}}
+    two = replace(one, cameras={**one.cameras, "2": other}, images=images, quality=quality)
+    said = " ".join(closing_table(two, Path("out")).split())
+    assert "refined of a.jpg and 1 other: f 3000.0 +- 1.0 refined of c.jpg: f 2000.0 +- 1.0" in said
 
 
 def test_closing_table_fits_80_columns():
