@@ -10,6 +10,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     anchored (3)   the same two with one photo that stood still, and `--still` says so: what the height of the scene is
                    worth, which level cameras that move so do not determine
     scene (1)      a rendered scene, from a drone that travels and vibrates, against its references
+    shaken (1)     another one, from a camera that vibrates by 10 mrad, 1.2 to 1.5 periods a frame, which bends photos
+                   by many pixels
     limit (3)      the bound that the measurements impose on the first two: those of the photos as they are, each moved
                    as the warp moves it, adjusted from the true poses and motions; no match is lost or wrong. Errors of
                    phi (mean over the photos, and about it, mrad a frame) and of log k, the height of the scene, with
@@ -55,7 +57,11 @@ from rsundistort.synthetic.unsteady import Vibration
 
 ROOT = Path(__file__).resolve().parent.parent
 HERZ, STOOD = "herz-jesus-8", "0003.jpg"
-PARTS = ("changing", "vibrating", "anchored", "limit", "scene", "harm", "steady")
+PARTS = ("changing", "vibrating", "anchored", "limit", "scene", "shaken", "harm", "steady")
+SCENES: dict[str, tuple[str, dict[str, Any]]] = {
+    "scene": ("flyover", {"amplitude_rad": 1.5e-3, "periods": [2, 5], "travel_m": 0.002}),
+    "shaken": ("courtyard", {"amplitude_rad": 10e-3, "periods": [1.2, 1.5]}),
+}
 # strength in rad a frame, change of the rate, amplitude of the vibration in rad, groups of bends that follow it
 MOTIONS = {"changing": (0.05, 0.5, 0.0, 1), "vibrating": (0.02, 0.0, 1.5e-3, 5)}
 COLUMNS = ("part", "seed", "model", "verdict", "dB", "worst", "before", "deg", "phi/sigma", "doubtful", "s")
@@ -177,16 +183,17 @@ def _phi(solution: rs.Solution, truth: rs.Solution) -> dict[str, Any]:
     return {"phi": motion_errors(solution, truth).phi_rad_per_frame / sigma}
 
 
-def scene(bench: Bench, seed: int) -> None:
-    """A rendered flight that travels and vibrates: the project's own recipe, with another motion."""
-    recipe = json.loads((ROOT / "sample_scenes" / "flyover" / "recipe.json").read_text())
+def scene(bench: Bench, part: str, seed: int) -> None:
+    """One of the project's own recipes with another motion: a drone that travels and vibrates, or a camera shaken."""
+    name, vibration = SCENES[part]
+    recipe = json.loads((ROOT / "sample_scenes" / name / "recipe.json").read_text())
     recipe["seed"] = recipe["seed"] + seed
-    recipe["motion"] = recipe["motion"] | {"vibration": {"amplitude_rad": 1.5e-3, "periods": [2, 5], "travel_m": 0.002}}
-    folder = bench.work / f"scene-{seed}"
+    recipe["motion"] = recipe["motion"] | {"vibration": vibration}
+    folder = bench.work / f"{part}-{seed}"
     folder.mkdir()
     (folder / "recipe.json").write_text(json.dumps(recipe))
     simulate_scene(folder / "recipe.json", folder / "scene", SceneOptions())
-    bench.measure("scene", seed, folder / "scene", folder / "scene" / "global", None)
+    bench.measure(part, seed, folder / "scene", folder / "scene" / "global", None)
 
 
 def limit(bench: Bench, kind: str, seed: int) -> None:
@@ -271,9 +278,9 @@ def main() -> int:
                 bench.measure(f"anchored, {kind}", seed, folder, references, bench.still, still={STOOD: 1e-4})
             for seed in seeds(3) if wanted and "limit" in args.only else ():
                 limit(bench, kind, seed)
-        if "scene" in args.only:
-            for seed in seeds(1):
-                scene(bench, seed)
+        for part in SCENES:
+            for seed in seeds(1) if part in args.only else ():
+                scene(bench, part, seed)
         if "harm" in args.only:
             harm(bench, seeds(1), references)
         if "steady" in args.only:

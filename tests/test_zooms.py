@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from rsundistort import Camera
+from rsundistort import Camera, RsUndistortWarning
+from rsundistort.errors import ReconstructionError
 from rsundistort.input.photo_cameras import GUESS_SIGMA, PhotoCameras
 from rsundistort.input.zooms import cameras_by_zoom
+from rsundistort.io.kept import Kept
+from rsundistort.solve.run import _by_zoom
 
 K = np.array([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]])
 NAMES = [f"{i}.jpg" for i in range(8)]
@@ -78,3 +86,52 @@ def test_a_single_photo_goes_to_the_camera_that_was_divided_off_before():
 )
 def test_others_stay_those_of_one_camera(focal_px):
     assert cameras_by_zoom(cameras(), NAMES, by_name(*focal_px) if focal_px else {}) is None
+
+
+@dataclass(frozen=True)
+class Loaded:
+    names: list[str]
+    cameras: PhotoCameras
+
+
+def solved_by(*outcomes: tuple[tuple[float, ...], float] | None) -> Any:
+    """A solver that comes to these focal lengths and residuals by turns, saying which; None: to an error."""
+    turn = iter(enumerate(outcomes))
+
+    def solve(loaded: Loaded, kept: Kept) -> tuple[Any, str]:
+        k, outcome = next(turn)
+        warnings.warn(f"solution {k}", RsUndistortWarning, stacklevel=2)
+        if outcome is None:
+            raise ReconstructionError("no")
+        focal_px, sigma_px = outcome
+        choice = SimpleNamespace(focal_px=by_name(*focal_px), varying=False)
+        shared = SimpleNamespace(image_names=NAMES, camera=lambda i: Camera(640, 480, K))
+        return SimpleNamespace(choice=choice, shared=shared, result=SimpleNamespace(sigma_px=sigma_px)), f"{k}"
+
+    return solve
+
+
+APART, ONE_MORE = (690, 900, 695, 700, 700, 910, 700, 705), (690, 900, 695, 700, 980, 910, 700, 705)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "taken", "notes"),
+    [
+        # each division that leaves less is taken, and all are told
+        (((APART, 0.3), (ONE_MORE, 0.2), ((700.0,) * 8, 0.1)), 2, 2),
+        # one that leaves more, or comes to nothing, leaves no word of it
+        (((APART, 0.3), ((700.0,) * 8, 0.4)), 0, 0),
+        (((APART, 0.3), None), 0, 0),
+        (((APART, 0.3), (ONE_MORE, 0.2), None), 1, 1),
+    ],
+)
+def test_what_is_said_is_of_the_solution_that_is_taken(outcomes, taken, notes):
+    loaded = Loaded(NAMES, replace(cameras()))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        _, solving, loaded = _by_zoom(solved_by(*outcomes), loaded, Kept())
+    assert solving == f"{taken}"
+    assert len(loaded.cameras.cameras) == (3 if taken else 2)
+    told = [str(each.message) for each in said]
+    assert told[0] == f"solution {taken}"
+    assert ["another focal length" in each for each in told[1:]] == [True] * notes

@@ -15,7 +15,7 @@ from .bundle_options import BundleOptions
 from .doubt import steps_to
 from .held_out import BENDS, MIN_AGREEMENT, MIN_FALL, SMOOTH_BENDS, ModelFit, ModelFits
 from .known_motions import compare_known_motions
-from .model_choice import LEAST_RIVAL, UNSEEN_PX, ModelChoice
+from .model_choice import LEAST_RIVAL, LEAST_SEEN_PX, ModelChoice
 
 __all__ = ["choose_model"]
 
@@ -162,7 +162,7 @@ def choose_model(
     against, agreement = selection.against if best is plain else [], None
     known = compare_known_motions(fits, plain, best)
     if best is not plain:
-        if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < UNSEEN_PX:
+        if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < LEAST_SEEN_PX:
             best = plain
         else:
             # what else bends photos knows nothing of motions that were measured elsewhere
@@ -188,7 +188,7 @@ def choose_model(
         {label: fit.rms_px for label, fit in fits.done.items()}, gain,
         {label: fit.left for label, fit in fits.done.items()}, tuple(kept), agreement, tuple(against),
         len(fits.held_out), best.residual_field, best.bends,
-        shutter != "not-determined" and fits.waves(best, _RESTLESS, UNSEEN_PX / 2), rival,
+        shutter != "not-determined" and fits.waves(best, _RESTLESS, LEAST_SEEN_PX / 2), rival,
         _steps_of_others(fits, best), known, rival_px=rival_px,
         focal_px=_focal_lengths(zooming.reconstruction) if zooming.varying else {},
     )  # fmt: skip

@@ -10,12 +10,12 @@ import numpy as np
 from .held_out import BENDS
 from .known_motions import KnownMotions
 
-__all__ = ["LEAST_RIVAL", "UNSEEN_PX", "ModelChoice"]
+__all__ = ["LEAST_RIVAL", "LEAST_SEEN_PX", "ModelChoice"]
 
 #: Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
 LEAST_RIVAL = 1 / 3
 #: Displacements below this, root mean square or mean over the photos, are not taken out of photos nor spoken of.
-UNSEEN_PX = 0.5
+LEAST_SEEN_PX = 0.5
 # Mean error of held-out measurements, 1 for noise alone, and pixels beyond it, that noise does not explain.
 _NOT_NOISE, _HELD_OUT_PX = 2.0, 0.5
 
@@ -107,7 +107,7 @@ class ModelChoice:
     @property
     def shows_rival(self) -> bool:
         """Whether that can be seen."""
-        return self.has_rival and self.rival_px >= UNSEEN_PX
+        return self.has_rival and self.rival_px >= LEAST_SEEN_PX
 
     def unexplained_px(self, sigma_px: float) -> float:
         """How far held-out measurements are off beyond their noise; 0 if by little more than noise, or half a pixel."""

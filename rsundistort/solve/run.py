@@ -216,6 +216,7 @@ def _by_zoom(
     solve: Callable[..., tuple[Solved, SolveOptions]], loaded: LoadedPhotos, kept: Kept
 ) -> tuple[Solved, SolveOptions, LoadedPhotos]:
     """The result of the photos; by cameras of their own for those that seem to have another zoom, if it fits better."""
+    told = list[str]()
     with _saying() as said:
         solved, solving = solve(loaded, kept=kept)
         for _ in range(_ZOOM_ROUNDS):
@@ -223,9 +224,8 @@ def _by_zoom(
             if apart is None:
                 break
             cameras, notes = apart
-            divided, before = replace(loaded, cameras=cameras), [*said]
+            divided, before, other = replace(loaded, cameras=cameras), [*said], None
             said.clear()
-            other = None
             # what was mapped before has other cameras: it is not kept
             with suppress(ReconstructionError, InputError):
                 other, solving_then = solve(divided, kept=Kept())
@@ -233,8 +233,9 @@ def _by_zoom(
                 said[:] = before
                 break
             solved, solving, loaded = other, solving_then, divided
-            for note in notes:
-                warnings.warn(note, RsUndistortWarning, stacklevel=4)
+            told += notes
+        for note in told:
+            warnings.warn(note, RsUndistortWarning, stacklevel=4)
     return solved, solving, loaded
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtr
 
@@ -269,8 +270,9 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
 
 def _no_parallax(rec: Reconstruction) -> list[str]:
     """Whether photos were taken so near to each other that hardly any depth is known."""
-    apart = np.linalg.norm(rec.center_w[:, None] - rec.center_w, axis=2) + np.diag(np.full(rec.num_images, np.inf))
-    share = float(np.median(apart.min(axis=1)) / rec.typical_depth)
+    # the nearest is the photo itself
+    nearest, _ = cKDTree(rec.center_w).query(rec.center_w, k=[2])
+    share = float(np.median(nearest) / rec.typical_depth)
     if not share < _NO_PARALLAX:
         return []
     return [
