@@ -164,6 +164,11 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     assert _repeated(order) is None
     axis, rotation = _repeated(replace(order, R_cw=order.R_cw[::-1]))
     assert (axis, rotation) == (2, pytest.approx(ROLL[2]))
+    # what is each photo's own may be a vibration; what they share is a lens, however it bends
+    waves = ROLL[2] * np.sin(np.linspace(0, 6, 7) + np.arange(8)[:, None])[:, :, None] * np.repeat([1.0, 0.0], 3)
+    alike = replace(order, R_cw=order.R_cw[::-1], bend_clock=np.tile([-0.5, 0.5], (8, 1)))
+    assert _repeated(replace(alike, bend=waves)) is None
+    assert _repeated(replace(alike, bend=waves[:1].repeat(8, 0)))[0] == 2
     # photos that came out wrong do not hide it
     phi = np.array(order.phi)
     phi[2] *= -40.0

@@ -413,6 +413,9 @@ def _repeated_of(camera: int, rec: Reconstruction, most: float) -> tuple[int, fl
     phi, R_cw = (rec.phi * rec.frame_span()[:, None])[mine], rec.R_cw[mine]
     half_px = float(rec.cameras[camera].K[0, 0]) / 2
     between = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec().mean(0)
+    # vibration is each photo's own, too: as much as a steady rotation over the frame of the same mean square
+    bend = rec.bend[mine][:, :, :3]
+    own = np.sqrt(12.0 * ((bend - bend.mean(0)) ** 2).mean((0, 1))) if rec.bends else np.zeros(3)
     # of all photos; and without the largest and smallest fifth, since photos that came out wrong hide what the others
     # have in common
     for trimmed in (0, m // 5):
@@ -421,7 +424,8 @@ def _repeated_of(camera: int, rec: Reconstruction, most: float) -> tuple[int, fl
         if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
             continue
         chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
-        alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
+        alike = np.abs(mean) > _REPEATED * np.hypot(spread, own)
+        alike &= (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
         alike &= per_clock < most
         if alike.any():
             axis = int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
