@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from clips import filmed
+from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, RunOptions
 from rsundistort.batch.progress import StageLog
+from rsundistort.bundle import bundle_adjust
 from rsundistort.bundle.path_prior import FramePath
 from rsundistort.errors import InputError, ReconstructionError, RsUndistortWarning
 from rsundistort.input import GyroOptions
@@ -18,6 +21,7 @@ from rsundistort.input.load import LoadedPhotos
 from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io.gyro import GyroLog
 from rsundistort.solve import video_path
+from rsundistort.solve.clip_pan import as_directions
 from rsundistort.solve.clip_verdict import FoundPath
 from rsundistort.solve.run import solve_frames
 from rsundistort.verdict.judge_path import ReadoutTime
@@ -158,3 +162,58 @@ def test_a_zoom_that_travel_explains_better_is_none(monkeypatch, by_zoom_px, by_
     keys = keys_of(Camera(64, 36, np.eye(3)))
     chosen = video_path._filmed_by(CLIP, keys, PATH, None, StageLog(None), None, lambda: (None, None))
     assert chosen.result.what == expected
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A camera that is swung about an axis behind it."""
+
+    length: float
+    seed: int = 3
+
+    def rotations(self, time):
+        angle = np.sin(np.asarray(time) * 2.0) - 0.5
+        return Rotation.from_rotvec(0.5 * angle[:, None] * [0.0, -1.0, 0.0]).as_matrix()
+
+    def centers(self, time):
+        return self.length * self.rotations(time)[:, 2]
+
+
+@pytest.mark.parametrize("length", [0.0, 0.1], ids=["on-a-tripod", "swung-on-an-arm"])
+def test_frames_far_apart_show_whether_a_camera_that_rotates_travels(length):
+    """Those of neighbours hide the travel of a camera on an arm, which looks like a longer focal length."""
+    seen, time_s = filmed(Arm(length), noise_px=0.1)
+    path = FramePath(time_s, 1 / 30, rotation_only=True)
+    options, standing = BundleOptions(path=path, refine=("f",)), np.zeros_like(seen.center_w)
+    rotated = bundle_adjust(as_directions(seen, replace(seen, center_w=standing)), "constant-motion", options)
+    turned = FoundPath(CLIP, rotated, options)
+    found = FoundPath(CLIP, SimpleNamespace(reconstruction=seen, sigma_px=0.1), options)
+    left_px = video_path._left_by_rotations(found, turned, StageLog(None))
+    assert left_px > 0.25 if length else left_px < 0.18
+    # a few frames say nothing of the others
+    few = seen.take_photos(np.arange(seen.num_images) < 12)
+    found = replace(found, result=SimpleNamespace(reconstruction=few, sigma_px=0.1))
+    assert video_path._left_by_rotations(found, turned, StageLog(None)) == 0.0
+
+
+@pytest.mark.parametrize("plausible", [True, False])
+def test_a_scene_that_shows_travel_takes_the_place_of_rotations(solve, monkeypatch, plausible):
+    """A lens that is none makes no scene; then rotations are doubtful."""
+
+    def check(*_):
+        if not plausible:
+            raise ReconstructionError("no such lens")
+
+    monkeypatch.setattr(PhotoCameras, "check_plausible", check)
+    turned, scene = (SimpleNamespace(reconstruction=SimpleNamespace(cameras=[]), sigma_px=0.1) for _ in range(2))
+    monkeypatch.setattr(video_path, "judged", lambda found, *_, **__: (found.result, found.travel_px))
+    monkeypatch.setattr(video_path, "_left_px", lambda _: 0.1)
+    monkeypatch.setattr(video_path, "_left_by_rotations", lambda *_: 0.15)
+    with pytest.warns(RsUndistortWarning, match="only rotated"):
+        assert solve(turned, True, scene) == (turned, 0.0)
+    monkeypatch.setattr(video_path, "_left_by_rotations", lambda *_: 0.3)
+    if plausible:
+        assert solve(turned, True, scene) == (scene, 0.0)
+    else:
+        with pytest.warns(RsUndistortWarning, match="travelled too little"):
+            assert solve(turned, True, scene) == (turned, 0.3)

@@ -23,6 +23,7 @@ from rsundistort.solve.video_path import (
     _with_known_lens,
     _with_unknown_lens,
 )
+from rsundistort.verdict.judge_path import ReadoutTime
 
 FRAME_S = 1 / 30
 
@@ -78,8 +79,8 @@ def clip_of(monkeypatch):
             by.append(matched.cameras[0].K[0, 0])
             return of_lens(by[-1])
 
-        def path(f, sigma_px):
-            result = SimpleNamespace(reconstruction=of_lens(f), sigma_px=sigma_px)
+        def path(f, sigma_px, readout_s=0.01):
+            result = SimpleNamespace(reconstruction=of_lens(f), sigma_px=sigma_px, readout=ReadoutTime(readout_s, 1e-5))
             return SimpleNamespace(clip=None, result=result, options=None, filmed=None)
 
         monkeypatch.setattr(video_path, "map_key_frames", map_again)
@@ -92,8 +93,9 @@ def clip_of(monkeypatch):
             return path(*last) if isinstance(last, tuple) else path(last, 0.1)
 
         monkeypatch.setattr(video_path, "_path_again", again)
+        monkeypatch.setattr(video_path, "readout_of", lambda result: result.readout)
         placed = of_lens(500.0), Matches(calibrated)
-        found = _travelled(None, None, None, StageLog(None), None, lambda: placed)
+        found = _travelled(SimpleNamespace(frame_s=0.04), None, None, StageLog(None), None, lambda: placed)
         assert not [*firsts], "a path was not asked for"
         assert not [*lasts], "an adjustment was not asked for"
         return by, found.result.reconstruction.cameras[0].K[0, 0]
@@ -120,6 +122,11 @@ def test_photos_that_cannot_be_mapped_again_keep_their_scene(clip_of):
 def test_the_last_adjustment_is_repeated_while_it_moves_the_lens_but_not_forever(clip_of):
     assert clip_of([(500.0, 0.2)], [470.0, 465.0])[1] == 465.0
     assert clip_of([(500.0, 0.2)], [470.0, 440.0, 410.0])[1] == 410.0
+    # steps that grow shorter arrive, though points that are new leave more
+    assert clip_of([(430.0, 0.2), (430.0, 0.2)], [(505.0, 0.1), (518.0, 0.104)])[1] == 518.0
+    # so do those of a readout time, whatever the lens
+    firsts, lasts = [(500.0, 0.2, 0.016)], [(500.0, 0.1, 0.019), (500.0, 0.11, 0.0199), (500.0, 0.11, 0.01995)]
+    assert clip_of(firsts, lasts, calibrated=True)[1] == 500.0
 
 
 @pytest.mark.parametrize("again", [(1230.0, 0.11), None], ids=["fits-less", "no-points"])

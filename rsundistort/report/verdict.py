@@ -182,6 +182,8 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
         return "care", "The shape was not examined", text
     if level and len(reasons) == 1:
         return level, _HEADLINES[level], sentence
+    if _only_rotated(solution):
+        return "doubt", "The rotations are doubtful", f"Do not trust the rotations. {text}"
     return "doubt", "The shape is doubtful", f"Do not trust the shape of the scene. {text}"
 
 

@@ -21,7 +21,7 @@ from ..sfm.features import Features
 from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
 
-__all__ = ["rotating_only", "rotation_between", "seen_again"]
+__all__ = ["as_directions", "rotating_only", "rotation_between", "seen_again"]
 
 _Corners = tuple[Array, Array]
 
@@ -232,6 +232,26 @@ def _joined(
         ),
     )  # fmt: skip
     return rec.with_points(np.ones(len(rec.observations), bool))
+
+
+def as_directions(scene: Reconstruction, turned: Reconstruction) -> Reconstruction:
+    """The photos and measurements of a scene, with the cameras and motions of frames that only rotate.
+
+    These have all its photos; its points are directions.
+    """
+    place = {name: i for i, name in enumerate(turned.image_names)}
+    own, obs = turned.rows([place[name] for name in scene.image_names]), scene.observations
+    R_cw, rays = own["R_cw"][obs.frame_idx], np.empty((len(obs), 3))
+    for k, camera in enumerate(turned.cameras):
+        mine = own["camera_idx"][obs.frame_idx] == k
+        rays[mine] = _directions(obs.xy_raw[mine], camera)
+    seen = np.isfinite(rays).all(axis=1)
+    total = np.zeros((scene.num_points, 3))
+    np.add.at(total, obs.point_idx[seen], np.einsum("nji,nj->ni", R_cw, rays)[seen])
+    size = np.linalg.norm(total, axis=1)
+    points_w = total / np.maximum(size, 1e-12)[:, None]
+    frames = replace(turned, image_names=scene.image_names, points_w=points_w, observations=obs, **own)
+    return frames.with_points(seen & (size[obs.point_idx] > 0))
 
 
 def _directions(xy_raw: Array, camera: Camera) -> Array:

@@ -52,6 +52,9 @@ class FoundPath:
         Whether the frames are as the sensor read them, if that was tested.
     felt : Felt, optional
         The gyroscope that took part.
+    travel_px : float
+        What frames that are taken to rotate only leave of points that frames far apart share, where a scene leaves much
+        less; else 0.
     """
 
     clip: Clip
@@ -59,6 +62,7 @@ class FoundPath:
     options: BundleOptions
     filmed: Stabilisation | None = None
     felt: Felt | None = None
+    travel_px: float = 0.0
 
     @property
     def path(self) -> FramePath:
@@ -116,8 +120,9 @@ def judged(
     if apart is not None and found.path.held_sigma:
         apart = apart._replace(fast=None)
     verdict = judge_clip(
-        result, of_keys, tested.halves, clip.frame_s, remedy, against, tested.vibration_px, apart, ratio
-    )
+        result, of_keys, tested.halves, clip.frame_s, remedy, against, tested.vibration_px, apart, ratio,
+        found.travel_px,
+    )  # fmt: skip
     if verdict.lens_only:
         warnings.warn(
             f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4

@@ -357,8 +357,10 @@ def solve_frames(
             seed=solving.seed, matching=options.matching, gyroscope=gyro_log, gyro_offset_s=around_s, kept=kept,
             at_once=at_once,
         )  # fmt: skip
-    of_registered(wanted, solved.shared)  # which names what was left out
+    registered = of_registered(wanted, solved.shared)  # which names what was left out
     cameras.check_plausible(solved.shared.cameras)
+    for text in cameras.contradicted(solved.shared.cameras, registered):
+        warnings.warn(text, RsUndistortWarning, stacklevel=3)
     lost = keys.unregistered(solved.shared.image_names)
     return replace(solved, unregistered=lost, camera_of=keys.camera_of, readouts=readouts)
 

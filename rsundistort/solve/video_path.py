@@ -23,12 +23,13 @@ from ..input.stabilisation import Stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..model import Camera, Reconstruction, opposite
+from ..model.reprojection import reprojection_residuals
 from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.judge_path import SIGMAS
 from .clip_direction import likely_directions, read_along
 from .clip_gyroscope import felt_gyroscope, own_gyroscope, readout_of
 from .clip_pair import FramePair
-from .clip_pan import rotating_only
+from .clip_pan import as_directions, rotating_only
 from .clip_stabilisation import as_filmed, was_stabilised
 from .clip_tracks import Followed, focused_as, follow_points, followed_again, with_all_frames
 from .clip_verdict import FoundPath, judged
@@ -48,6 +49,9 @@ _FLOW_PX, _OUTLIERS = 0.25, 0.2
 _EXACT_PX = 0.125
 # Times that error after a first adjustment, which knows neither the rotations' size nor the readout.
 _AT_FIRST = 4.0
+# A scene is one if rotations leave of its measurements so many times what it leaves, by this quantile, and if it has
+# such a share of the frames that rotations explain.
+_PARALLAX, _MOST, _LEAST_SHARED = 1.5, 0.75, 0.8
 # Times that frames which only rotate are adjusted again, since some are missing between them.
 _GAP_ROUNDS = 3
 # Solves that estimate the prior standard deviations of a path, and the share by which these may still change: with
@@ -64,6 +68,8 @@ _FOCUSES = 5e-4
 # A scene is mapped again by the focal length that its path found, and a path is found again, if focal lengths differ by
 # these shares; so many times.
 _MAPPED_BY, _SOLVED_BY, _LENS_ROUNDS = 0.05, 0.03, 3
+# So may it be if its readout time moved by this share of the time between frames.
+_SETTLED_BY = 0.01
 # If new points are fewer than this share of those before, rays may meet at this angle: ten times what pixels measure.
 _LEAST_SHARE, _LEAST_DEG = 0.3, 0.2
 # Standard deviation of a readout time, as a share of the time between frames, that no false axis of it leaves.
@@ -129,8 +135,9 @@ def solve_clip(
     keys, found = _as_read(directions, along, clip.frame_s)
     tell_of_gaps(clip, found.clip)
     if found.path.rotation_only:
+        why = "travelled too little" if found.travel_px else "only rotated"
         warnings.warn(
-            "the camera only rotated: without parallax there are directions, but no positions and no scene",
+            f"the camera {why}: without parallax there are directions, but no positions and no scene",
             RsUndistortWarning, stacklevel=3,
         )  # fmt: skip
     alone = readout_of(found.result)
@@ -168,10 +175,9 @@ def _filmed_by(
 ) -> FoundPath:  # fmt: skip
     """The path of the camera: of one that only rotates, through two frames, or of one that travels."""
     rotated, explained = _only_rotated(clip, keys, path, options_of, log)
-    if rotated is not None and explained == "by rotations":
-        return rotated
     if len(clip.names) == 2:
-        return _of_two(clip, keys, path, options_of, log)
+        two = rotated if explained == "by rotations" else None
+        return two or _of_two(clip, keys, path, options_of, log)
     direction = keys.cameras.of(0).readout
 
     def read_so() -> tuple[Reconstruction, MatchedPhotos]:
@@ -187,6 +193,14 @@ def _filmed_by(
         return rotated
     if rotated is None:
         return found
+    if explained == "by rotations":
+        left_px = _left_by_rotations(found, rotated, log)
+        if left_px <= _PARALLAX * _left_px(found.result.reconstruction):
+            return rotated
+        with suppress(ReconstructionError):
+            keys.cameras.check_plausible(found.result.reconstruction.cameras)
+            return found
+        return replace(rotated, travel_px=left_px)
     # a lens that zooms, or that nobody knows, makes of travel a rotation; what explains the frames better was it
     explains = explained in ("by zooming", "by a lens") and rotated.result.sigma_px <= found.result.sigma_px
     return rotated if explains or (_shows_readout(rotated) and not _shows_readout(found)) else found
@@ -290,6 +304,27 @@ def _rotated_again(before: BundleResult, options: BundleOptions, log: StageLog) 
     return bundle_adjust(before.reconstruction, "constant-motion", how, told), options
 
 
+def _left_by_rotations(found: FoundPath, rotated: FoundPath, log: StageLog) -> float:
+    """What rotations leave of most measurements of a scene, pixels; 0 if they have too few of its frames.
+
+    Those of neighbouring frames, which rotations explained, hide the travel of a camera that is swung on an arm: nearly
+    all of it looks like a longer focal length. Points of a scene are seen in frames far apart.
+    """
+    rec, turned = found.result.reconstruction, rotated.result.reconstruction
+    shared = np.isin(rec.image_names, turned.image_names)
+    if shared.sum() < _LEAST_SHARED * turned.num_images:
+        return 0.0
+    path = replace(rotated.path, start=rotated.result.path_start())
+    how = replace(rough_options(rotated.options), path=path, outlier_rounds=0)
+    start = as_directions(rec.take_photos(shared), turned)
+    return _left_px(bundle_adjust(start, "constant-motion", how, partial(tell, log, "rotations")).reconstruction)
+
+
+def _left_px(reconstruction: Reconstruction) -> float:
+    """Error of measurements that most do not exceed, in pixels: what is near shows parallax, what is far does not."""
+    return float(np.quantile(np.linalg.norm(reprojection_residuals(reconstruction)[0], axis=1), _MOST))
+
+
 def _is_held(clip: Clip, path: FramePath, result: BundleResult) -> bool:
     """Whether frames that only rotate shake faster than a path through them follows."""
     own = own_motions(result.reconstruction, rotation_only=True)
@@ -346,19 +381,21 @@ def _travelled(
         if not other.result.sigma_px < found.result.sigma_px:
             break
         found = other
+    moved = np.inf
     for repeats in range(_LENS_ROUNDS):
-        before = found
+        before, moved_before = found, moved
         try:
             found = _path_again(before, options_of, log, matched)
         except ReconstructionError:
             if not repeats:
                 raise
             break
-        if repeats and found.result.sigma_px > before.result.sigma_px:
+        moved = _unsettled(found.result, before.result, clip.frame_s, by_lens=not matched.calibrated)
+        if repeats and found.result.sigma_px > before.result.sigma_px and not moved < moved_before:
             found = before  # it ran away, as where frames that were knocked are among them
             break
-        # what was an outlier by one lens is none by another
-        if matched.calibrated or not _is_other_lens(found.result, before.result.reconstruction.cameras[0], _SOLVED_BY):
+        # what was an outlier by one lens, or readout, is none by another
+        if not moved > 1.0:
             break
     return FoundPath(found.clip, found.result, found.options, found.filmed)
 
@@ -486,6 +523,19 @@ def _explains_more(varying: BundleResult, steady: BundleResult) -> bool:
 def _is_other_lens(found: BundleResult, assumed: Camera, tolerance: float) -> bool:
     """Whether a scene would be another one by the focal length that its path found."""
     return bool(abs(np.log(found.reconstruction.cameras[0].K[0, 0] / assumed.K[0, 0])) > tolerance)
+
+
+def _unsettled(found: BundleResult, before: BundleResult, frame_s: float, *, by_lens: bool) -> float:
+    """How far a path moved, in what would have changed its points: focal lengths, and the readout time.
+
+    The readout time counts if it has moved beyond its deviations.
+    """
+    now, then = readout_of(found), readout_of(before)
+    apart = abs(now.seconds - then.seconds)
+    of_readout = apart / (_SETTLED_BY * frame_s) if apart > SIGMAS * now.sigma else 0.0
+    lens = before.reconstruction.cameras[0]
+    of_lens = abs(np.log(found.reconstruction.cameras[0].K[0, 0] / lens.K[0, 0])) / _SOLVED_BY if by_lens else 0.0
+    return float(max(of_lens, of_readout))
 
 
 def _end_path(log: StageLog, stage: str, clip: Clip, whole: Reconstruction, result: BundleResult) -> None:

@@ -52,6 +52,7 @@ def judge_clip(
     vibration_px: float = 0.0,
     speeds: BySpeed | None = None,
     rotation_ratio: float = 1.0,
+    travel_px: float = 0.0,
 ) -> Verdict:
     """Judge the path of a video.
 
@@ -75,6 +76,8 @@ def judge_clip(
         What slow and fast rotations say.
     rotation_ratio : float
         Rotations of the frames over those of the gyroscope.
+    travel_px : float
+        What rotations leave of points that frames far apart share, where a scene leaves much less; else 0.
 
     Returns
     -------
@@ -120,6 +123,11 @@ def judge_clip(
         reasons.append(
             f"The frames rotate {rotation_ratio:.2f} times as far as the gyroscope: by it the focal length is "
             f"{rotation_ratio * rec.cameras[0].K[0, 0]:.0f} px, not {rec.cameras[0].K[0, 0]:.0f} px."
+        )
+    if travel_px > 0:
+        reasons.append(
+            f"The camera travelled, too: rotations leave {travel_px:.1f} px of what frames far apart share. The focal "
+            "length and the rotations may be wrong by some percent."
         )
     lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
