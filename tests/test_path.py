@@ -349,6 +349,9 @@ def test_a_path_is_doubted_that_slow_rotations_or_a_gyroscope_contradict() -> No
     assert reasons() == reasons(speeds=(slow, time)) == reasons(rotation_ratio=0.97)
     slow = ReadoutTime(time.seconds - 5 * time.sigma, time.sigma)
     assert any("by slow rotations alone" in reason for reason in reasons(speeds=(slow, time)))
+    assert reasons() == reasons(share_that_fits=0.95)
+    assert any("fit only 75 % of what key frames share" in reason for reason in reasons(share_that_fits=0.75))
+    assert any("rotations leave 0.3 px" in reason for reason in reasons(travel_px=0.3))
     f = found.reconstruction.cameras[0].K[0, 0]
     assert any(f"by it the focal length is {0.92 * f:.0f} px" in reason for reason in reasons(rotation_ratio=0.92))
 

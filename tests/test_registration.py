@@ -16,7 +16,7 @@ from rsundistort.bundle import BundleOptions, bundle_adjust
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.model.similarity import Similarity
 from rsundistort.sfm import map_photos, map_without_motions, read_num_verified, register_photos, verification
-from rsundistort.sfm.contradiction import contradicting_photos, parts_that_agree
+from rsundistort.sfm.contradiction import contradicting_photos, parts_that_agree, share_that_fits
 from rsundistort.sfm.epipolar import agreeing_photos, read_matches
 from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
@@ -478,3 +478,10 @@ def test_motions_of_weak_shutters_are_not_searched(scene, matched):
     registrar = Registrar(TrackSource(matched, with_found_motions=find), BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(scene.take_photos(np.arange(6) < 5), "rotation", rough_options(BundleOptions()))
     assert registrar.without_motions(start, {"5.jpg"}) == (registrar, start, {"5.jpg"})
+
+
+def test_poses_fit_the_matches_of_what_they_are_relative_to(scene, matched):
+    verified = read_num_verified(matched)
+    assert share_that_fits(matched, verified, scene) > 0.95
+    assert share_that_fits(matched, verified, with_a_side_turned(scene, 3)) < 0.7
+    assert share_that_fits(matched, dict.fromkeys(verified, 29), scene) == 1.0

@@ -369,8 +369,8 @@ def _judge(
         return "none", f"not stabilised: the lines rotate as much as the frames, the other way ({alike})"
     if detectable and high < least:
         return "stabilised", (
-            f"stabilised in the camera: rotation between the frames without its shutter (readout {found}, expected "
-            f"{wanted}; if the camera has a global shutter: run --model global)"
+            f"read at once, or stabilised in the camera: rotation between the frames without its shutter (readout "
+            f"{found}, expected {wanted}; if the camera has a global shutter: run --model global)"
         )
     if detectable and low > most:
         return "stabilised", (

@@ -228,6 +228,8 @@ def _unneeded(solution: Solution, largest: float | None) -> str:
     plain, ours = held_out.get("global"), held_out.get(solution.shutter_model)
     if plain and ours and ours > (1 - _LEAST_GAIN) * plain:
         return "without the shutter, held-out measurements are predicted as well"
+    if _is_video(solution):
+        return "the shutter displaced hardly anything by as much as a pixel"
     return ""
 
 

@@ -12,9 +12,9 @@ from ..model import Reconstruction
 from ..model.array_types import Index, Mask
 from .connected import common_points
 from .database import MatchedPhotos
-from .epipolar import FreedMatches
+from .epipolar import FreedMatches, matches_that_fit
 
-__all__ = ["contradicting_photos", "parts_that_agree"]
+__all__ = ["contradicting_photos", "parts_that_agree", "share_that_fits"]
 
 Pair = tuple[int, int]
 # Evidence of a pair: the number of matches, and how many more of them fit than would have to.
@@ -31,6 +31,26 @@ _LEAST_MATCHES = 30
 # So many pairs decide on two parts, those with the most matches: they are neighbours. In a scene that repeats itself
 # many more pairs only look alike, and contradict poses that are right.
 _DECIDING = 3
+
+
+def share_that_fits(matched: MatchedPhotos, num_verified: Mapping[Pair, int], reconstruction: Reconstruction) -> float:
+    """Share of the matches of photos that poses fit, of those that any epipolar geometry does; 1 if there are none.
+
+    Where something large moves, poses may be those relative to it, and the rest of the scene is left out.
+
+    Parameters
+    ----------
+    matched, num_verified
+        As `contradicting_photos` takes them.
+    """
+    posed, fitting = set(reconstruction.image_names), matches_that_fit(matched, reconstruction)
+    shares = [
+        (min(len(fitting.get(pair, ())), count), count)
+        for pair, count in num_verified.items()
+        if count >= _LEAST_MATCHES and posed >= {matched.names[k] for k in pair}
+    ]
+    of_fitting, of_all = map(sum, zip(*shares, strict=True)) if shares else (1, 1)
+    return of_fitting / of_all
 
 
 def contradicting_photos(

@@ -55,6 +55,8 @@ class FoundPath:
     travel_px : float
         What frames that are taken to rotate only leave of points that frames far apart share, where a scene leaves much
         less; else 0.
+    share_that_fits : float
+        Share of the matches of key frames that its poses fit.
     """
 
     clip: Clip
@@ -63,6 +65,7 @@ class FoundPath:
     filmed: Stabilisation | None = None
     felt: Felt | None = None
     travel_px: float = 0.0
+    share_that_fits: float = 1.0
 
     @property
     def path(self) -> FramePath:
@@ -121,7 +124,7 @@ def judged(
         apart = apart._replace(fast=None)
     verdict = judge_clip(
         result, of_keys, tested.halves, clip.frame_s, remedy, against, tested.vibration_px, apart, ratio,
-        found.travel_px,
+        found.travel_px, found.share_that_fits,
     )  # fmt: skip
     if verdict.lens_only:
         warnings.warn(

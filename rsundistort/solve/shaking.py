@@ -79,11 +79,14 @@ def with_slow_rotations(result: BundleResult, path: FramePath, speeds: BySpeed |
     """The readout time of slow rotations in place of the one at which the path was held, if it was.
 
     `speeds` are those about the path that was found, whose bends make them more exact than they were before it. The
-    difference from the time that was held counts as a part of the standard deviation.
+    difference from the time that was held counts as a part of the standard deviation. Where they are less exact, so is
+    the time that was held: it is that of a path that is no better known.
     """
     found, slow = result.path, None if speeds is None else speeds.slow
-    if not path.held_sigma or slow is None or found is None or not slow.sigma < _AS_EXACT * path.held_sigma:
+    if not path.held_sigma or slow is None or found is None:
         return result
+    if not slow.sigma < _AS_EXACT * path.held_sigma:
+        return replace(result, path=replace(found, sigma_readout_s=np.maximum(found.sigma_readout_s, slow.sigma)))
     sigma = np.hypot(slow.sigma, slow.seconds - found.readout_s)
     return replace(result, path=replace(found, readout_s=np.full_like(sigma, slow.seconds), sigma_readout_s=sigma))
 

@@ -25,6 +25,8 @@ from ..io.kept import Kept
 from ..model import Camera, Reconstruction, opposite
 from ..model.reprojection import reprojection_residuals
 from ..sfm import MatchedPhotos, retriangulate
+from ..sfm.contradiction import share_that_fits
+from ..sfm.epipolar import read_num_verified
 from ..verdict.judge_path import SIGMAS
 from .clip_direction import likely_directions, read_along
 from .clip_gyroscope import felt_gyroscope, own_gyroscope, readout_of
@@ -364,6 +366,7 @@ def _travelled(
 ) -> FoundPath:  # fmt: skip
     """The path of a camera that travels, from the scene of its key frames, mapped as of a global shutter."""
     mapped, matched = placed()
+    num_verified = read_num_verified(matched)  # new tracks overwrite them
     found = _first_path(clip, path, options_of, log, telemetry, mapped, matched)
     # in a scene that was mapped by a wrong lens frames bend as by a shutter
     for _ in range(_LENS_ROUNDS):
@@ -397,7 +400,9 @@ def _travelled(
         # what was an outlier by one lens, or readout, is none by another
         if not moved > 1.0:
             break
-    return FoundPath(found.clip, found.result, found.options, found.filmed)
+    are_keys = found.clip.are_keys(found.result.reconstruction.image_names)
+    share = share_that_fits(matched, num_verified, found.result.of_photos(are_keys).reconstruction)
+    return FoundPath(found.clip, found.result, found.options, found.filmed, share_that_fits=share)
 
 
 @dataclass(frozen=True)
@@ -440,12 +445,20 @@ def _first_path(
     log.end("flow", observations=len(followed.frame))
     log.begin("path")
     whole = with_all_frames(clip, scene, followed).without_photos(_LEAST_MEASUREMENTS)
-    own = own_motions(whole)
+    own, said = own_motions(whole), (clip, path)
     clip, path = with_gaps(clip, path, whole, own)
     path, filmed = as_filmed(clip, whole, path, telemetry, own)
+    by_lens = _with_known_lens if matched.calibrated else _with_unknown_lens
+    if was_stabilised(filmed):
+        # so are lines that rotate by more than a scene without a shutter, whose points they bend, can show
+        free = by_lens(whole, _at_first(replace(options_of(whole), path=said[1])), log).reconstruction
+        with_shutter = own_motions(free)
+        other_clip, other_path = with_gaps(*said, free, with_shutter)
+        other_path, other = as_filmed(other_clip, free, other_path, telemetry, with_shutter)
+        if not was_stabilised(other):
+            clip, path, filmed, whole, own = other_clip, other_path, other, free, with_shutter
     held = path if was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
     options = replace(options_of(whole), path=held)
-    by_lens = _with_known_lens if matched.calibrated else _with_unknown_lens
     result = by_lens(whole, _at_first(options), log)
     if held.held_sigma:
         # what a rough scene shows, and no path follows, a better one may not
