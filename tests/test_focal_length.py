@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rsundistort import Camera, read_solution
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
-from rsundistort.errors import ReconstructionError
+from rsundistort.errors import ReconstructionError, RsUndistortWarning
 from rsundistort.input.load import load_photos
 from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.input.unknown_focal import warn_of_weak_focal_lengths, with_focal_lengths
@@ -133,6 +133,19 @@ def test_a_camera_like_none_is_not_believed(found, says):
     with pytest.raises(ReconstructionError, match=f"the photos do not determine their camera: {says}.*--camera"):
         cameras.check_plausible([odd])
     replace(cameras, without_focal=[]).check_plausible([odd])  # EXIF is another matter
+
+
+def test_photos_that_were_cropped_off_their_middle_are_a_camera_if_they_determine_it():
+    guess = Camera(320, 240, [[272.0, 0, 159.5], [0, 272.0, 119.5], [0, 0, 1]])
+    cameras = PhotoCameras([guess], ["a"], np.zeros(3, int), False, (False,), "", sigma=[{"f": 0.3}], without_focal=[0])
+    cropped = Camera(320, 240, [[272.0, 0, 190], [0, 272.0, 119.5], [0, 0, 1]])
+    with pytest.warns(RsUndistortWarning, match=r"at \(190, 120\), far off the middle of 320x240: .* cropped"):
+        cameras.check_plausible([cropped], [{"cx": 0.5}])
+    with pytest.raises(ReconstructionError, match="do not determine their camera: cx"):
+        cameras.check_plausible([cropped], [{"cx": 5.0}])
+    # whatever else is odd, too, is no crop
+    with pytest.raises(ReconstructionError, match="do not determine their camera"):
+        cameras.check_plausible([replace(cropped, dist=[-2.0, 2.4, 0, 0, -1.0])], [{"cx": 0.5, "k1": 0.01}])
 
 
 @pytest.mark.slow

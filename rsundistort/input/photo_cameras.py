@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..bundle import BundleOptions, GuessedCameras, deviation, pixels_of
 from ..bundle.intrinsics import check_lenses
-from ..errors import InputError, ReconstructionError
+from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..io import CameraFile, ExifFacts, camera_from_exif, check_camera_fits, groups_of, guess_readouts, read_camera_file
 from ..model import Camera, check_readout
 from ..model.array_types import Index
@@ -120,25 +121,42 @@ class PhotoCameras:
             self, sigma=[{**old, **_relative(sigma, c)} for old, c in zip(specified, self.cameras, strict=True)]
         )  # fmt: skip
 
-    def check_plausible(self, cameras: Sequence[Camera]) -> None:
+    def check_plausible(self, cameras: Sequence[Camera], sigmas: Sequence[Mapping[str, float]] = ()) -> None:
         """Refuse implausible estimates of cameras that were unknown: `cameras` are the estimates.
 
-        Photos without parallax, or of things that move, make a lens of whatever bends them.
+        Photos without parallax, or of things that move, make a lens of whatever bends them. A principal point alone
+        that lies off the middle is that of photos that were cropped, if they determine it: a warning.
+
+        Parameters
+        ----------
+        sigmas : sequence of mapping
+            Standard deviations of each camera's intrinsics, in pixels or of the coefficients.
 
         Raises
         ------
         ReconstructionError
             With what is odd.
         """
-        for k, name, times in self.known_to(loose=True).surprises(cameras):
-            if k in self.without_focal and times > _LIKE_NO_CAMERA:
-                (fx, _, cx), (_, fy, cy), _ = cameras[k].K.tolist()
-                value = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **cameras[k].coefficients}[name]
-                raise ReconstructionError(
-                    f"the photos do not determine their camera: {name} = {value:.3g} would be {times:.0f} standard "
-                    "deviations from what such cameras have; give --camera FILE or --camera fx,fy,cx,cy in pixels "
-                    "(of a fisheye a FILE, which names its lens)"
-                )
+        odd = [
+            each for each in self.known_to(loose=True).surprises(cameras)
+            if each[0] in self.without_focal and each[2] > _LIKE_NO_CAMERA
+        ]  # fmt: skip
+        for k, name, times in odd:
+            (fx, _, cx), (_, fy, cy), _ = cameras[k].K.tolist()
+            value = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **cameras[k].coefficients}[name]
+            sigma = sigmas[k].get(name, np.inf) if sigmas else np.inf
+            if {each for i, each, _ in odd if i == k} <= {"cx", "cy"} and sigma < GUESS_SIGMA["cx"] * fx:
+                warnings.warn(
+                    f"{self.labels[k]}: its principal point is at ({cx:.0f}, {cy:.0f}), far off the middle of "
+                    f"{cameras[k].width}x{cameras[k].height}: the photos were probably cropped",
+                    RsUndistortWarning, stacklevel=3,
+                )  # fmt: skip
+                continue
+            raise ReconstructionError(
+                f"the photos do not determine their camera: {name} = {value:.3g} would be {times:.0f} standard "
+                "deviations from what such cameras have; give --camera FILE or --camera fx,fy,cx,cy in pixels "
+                "(of a fisheye a FILE, which names its lens)"
+            )
 
     def contradicted(self, cameras: Sequence[Camera], options: BundleOptions) -> list[str]:
         """Calibrations that the photos contradict, for people; `cameras` are the estimates with these options."""

@@ -127,7 +127,9 @@ def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str
 def _guesses(solved: Solved) -> list[str]:
     """Guesses of the cameras, and the result of the measurements, for people."""
     choice, cameras = solved.directions, solved.cameras
-    if choice is None or not choice.changed:
+    # without a shutter no line is read before another: what fitted better was a lens that varies
+    none = solved.verdict is not None and solved.verdict.shutter == "not-found"
+    if choice is None or not choice.changed or none:
         return list(cameras.notes)
     return [
         f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "

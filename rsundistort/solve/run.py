@@ -301,7 +301,7 @@ def _solve(
             always_affine=options.features == "affine",
         )  # fmt: skip
     rec = solved.shared
-    cameras.check_plausible(rec.cameras)
+    cameras.check_plausible(rec.cameras, solved.result.sigma_intrinsics)
     contradictions = [
         known_contradiction(rec, from_gyro, options.solve.known, solved.known_motions),
         *cameras.contradicted(rec.cameras, options_of(rec)),

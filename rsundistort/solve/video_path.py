@@ -451,12 +451,12 @@ def _first_path(
     by_lens = _with_known_lens if matched.calibrated else _with_unknown_lens
     if was_stabilised(filmed):
         # so are lines that rotate by more than a scene without a shutter, whose points they bend, can show
-        free = by_lens(whole, _at_first(replace(options_of(whole), path=said[1])), log).reconstruction
-        with_shutter = own_motions(free)
-        other_clip, other_path = with_gaps(*said, free, with_shutter)
-        other_path, other = as_filmed(other_clip, free, other_path, telemetry, with_shutter)
+        better = by_lens(whole, _at_first(replace(options_of(whole), path=said[1])), log).reconstruction
+        with_shutter = own_motions(better)
+        other_clip, other_path = with_gaps(*said, better, with_shutter)
+        other_path, other = as_filmed(other_clip, better, other_path, telemetry, with_shutter)
         if not was_stabilised(other):
-            clip, path, filmed, whole, own = other_clip, other_path, other, free, with_shutter
+            clip, path, filmed, whole, own = other_clip, other_path, other, better, with_shutter
     held = path if was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
     options = replace(options_of(whole), path=held)
     result = by_lens(whole, _at_first(options), log)

@@ -144,8 +144,13 @@ def judge(
         reasons += _no_parallax(rec)
     if rec.shutter_model == "global":
         shutter, why = _of_global(result, choice, options)
-        misplaced = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
-        return _verdict(shutter, reasons + why, dict.fromkeys(suspects, _SUSPECT) | misplaced)
+        doubts = _of_measurements(rec, _outliers(rec, tracks))
+        left = bool(unexplained) or (choice is not None and bool(choice.against))
+        for name, said in _misplaced(result, left).items() if strong else ():
+            doubts[name].append(said)
+        for name in suspects:
+            doubts[name].append(_SUSPECT)
+        return _verdict(shutter, reasons + why, _texts(doubts))
     given = options or BundleOptions()
     known = {*given.known_phi, *given.held_phi, *given.still}
     motions, outliers = photo_motions(result), _outliers(rec, tracks)
@@ -175,7 +180,7 @@ def judge(
     # a model that the user named is applied
     lost |= shutter == "not-determined" and choice is not None
     lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each and name not in known)
-    return _verdict(shutter, reasons, {name: "; ".join(why) for name, why in doubts.items() if why}, lens_only)
+    return _verdict(shutter, reasons, _texts(doubts), lens_only)
 
 
 def _verdict(
@@ -363,8 +368,14 @@ def _of_motions(
             f"like that{travel}{' (--model constant-motion)' if travel else ''}."
         )
     by_known = None if choice is None else choice.known_motions
-    if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
+    measured = by_known is not None and by_known.is_better
+    if 2 * torn.sum() > rec.num_images and not measured:
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
+    elif (torn & ~np.isin(rec.image_names, [*known]))[seen].all() and not measured:
+        shown = ", ".join(np.array(rec.image_names)[seen].tolist())
+        reasons.append(
+            f"Only {shown} would show a shutter, and most of what that shows contradicts the rest or itself."
+        )
     evident = (_EVIDENT * motions.relative_sigma < 1.0) | np.isin(rec.image_names, [*known])
     # photos together show what none of them does alone
     evident |= result.common is not None and result.common.is_certain
@@ -453,27 +464,37 @@ def _doubts(
     rotation = rec.phi * rec.frame_span()[:, None]
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
     times = _times_usual(rec, result.phi_rms)
-    counts = _counts(rec)
-    doubts: dict[str, list[str]] = {}
-    for i, name in enumerate(rec.image_names):
-        said = doubts[name] = []
-        if counts[i] < _FEW:
-            said.append(f"only {counts[i]} measurements")
+    doubts = _of_measurements(rec, outliers)
+    for i, said in enumerate(doubts.values()):
         if motions.covered[i] < _CORNER:
             said.append(f"its measurements lie in {100 * motions.covered[i]:.0f} % of its frame")
-        if outliers[i] > _OUTLIERS:
-            said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
         if motions.difference_px[i] > UNSEEN_PX:
             said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
         if times[i] > _FAR and motions.shift_px[i] > UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
-        most = 2 * phi_limits.get(name, np.inf)
+        most = 2 * phi_limits.get(rec.image_names[i], np.inf)
         if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most:
             said.append(
                 f"it appears to have rotated by {np.degrees(np.linalg.norm(rotation[i])):.2f} degrees, but would be "
                 f"blurred by more than {np.degrees(most):.2f}"
             )
     return doubts
+
+
+def _of_measurements(rec: Reconstruction, outliers: Array) -> dict[str, list[str]]:
+    """Reasons against each photo, whatever moved it."""
+    doubts, counts = {name: list[str]() for name in rec.image_names}, _counts(rec)
+    for i, said in enumerate(doubts.values()):
+        if counts[i] < _FEW:
+            said.append(f"only {counts[i]} measurements")
+        if outliers[i] > _OUTLIERS:
+            said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
+    return doubts
+
+
+def _texts(doubts: Mapping[str, list[str]]) -> dict[str, str]:
+    """Reasons against each photo that has any, as one text."""
+    return {name: "; ".join(why) for name, why in doubts.items() if why}
 
 
 def _times_usual(rec: Reconstruction, phi_rms: float) -> Array:
