@@ -343,12 +343,15 @@ def test_a_path_is_doubted_that_slow_rotations_or_a_gyroscope_contradict() -> No
     time = ReadoutTime(float(found.path.readout_s[0]), float(found.path.sigma_readout_s[0]))
 
     def reasons(**evidence: Any) -> tuple[str, ...]:
-        return judge_clip(found, found, None, FRAME_S, **evidence).reasons
+        return judge_clip(found, found, frame_s=FRAME_S, **{"halves": None} | evidence).reasons
 
     slow = ReadoutTime(time.seconds - 2 * time.sigma, time.sigma)
     assert reasons() == reasons(speeds=(slow, time)) == reasons(rotation_ratio=0.97)
     slow = ReadoutTime(time.seconds - 5 * time.sigma, time.sigma)
     assert any("by slow rotations alone" in reason for reason in reasons(speeds=(slow, time)))
+    late, later = (ReadoutTime(time.seconds + k * time.sigma, time.sigma) for k in (3, 5))
+    assert reasons() == reasons(halves=(late, ReadoutTime(time.seconds - 0.5 * time.sigma, time.sigma)))
+    assert any("by its halves" in reason for reason in reasons(halves=(late, later)))
     assert reasons() == reasons(share_that_fits=0.95)
     assert any("fit only 75 % of what key frames share" in reason for reason in reasons(share_that_fits=0.75))
     assert any("rotations leave 0.3 px" in reason for reason in reasons(travel_px=0.3))

@@ -174,7 +174,19 @@ def _contradictions(
                 f"The readout time is {1e3 * a.seconds:.1f} ms by the first half of the video and "
                 f"{1e3 * b.seconds:.1f} ms by the second, {apart:.0f} standard deviations apart."
             )
+        elif _is_outside(time, halves):
+            reasons.append(
+                f"The readout time is {1e3 * time.seconds:.1f} +- {1e3 * time.sigma:.1f} ms by the whole video, "
+                f"{1e3 * a.seconds:.1f} and {1e3 * b.seconds:.1f} ms by its halves."
+            )
     return reasons
+
+
+def _is_outside(time: ReadoutTime, halves: tuple[ReadoutTime, ReadoutTime]) -> bool:
+    """Whether a readout time is not that of its halves together, as it is where all fit the same path."""
+    weights = np.array([each.sigma for each in halves]) ** -2.0
+    mean = float(np.average([each.seconds for each in halves], weights=weights))
+    return bool(abs(time.seconds - mean) > SIGMAS * max(time.sigma, float(weights.sum()) ** -0.5))
 
 
 def _is_too_long(unbounded_s: float, sigma_s: float, frame_s: float) -> bool:
@@ -252,6 +264,8 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
         if apart > SIGMAS:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
+        if _is_outside(ReadoutTime(seconds, sigma), (ReadoutTime(**first), ReadoutTime(**second))):
+            return "the halves of the video contradict the whole"
     if evidence.get("by_speed"):
         slow, fast = (ReadoutTime(each["seconds"], each["sigma"]) for each in evidence["by_speed"])
         if evidence["source"] != BY_SLOW_ROTATIONS and _runs_the_other_way(slow, fast):
