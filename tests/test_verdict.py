@@ -149,6 +149,47 @@ def test_a_wrong_lens_is_no_trusted_shape(sigma, rng):
     assert named(wrong, options=BundleOptions(refine=("k1",)))[1].shape == "trusted"
 
 
+def with_few_of(rec, photo, share):
+    """Some of the measurements of a photo only."""
+    frame = rec.observations.frame_idx
+    return rec.with_points((frame != photo) | (np.cumsum(frame == photo) <= share * (frame == photo).sum()))
+
+
+def test_one_photo_that_contradicts_the_others_shows_no_shutter(rng):
+    phi = np.zeros((8, 3))
+    phi[3] = [0.05, 0.02, 0.0]
+    rec = measured(rng, phi)
+    few = with_few_of(rec, 3, 0.3)
+    for tracks, shutter in ((few, "found"), (rec, "not-determined")):
+        verdict = judge(bundle_adjust(few, "rotation"), None, choice_of("rotation", gain=9.0), tracks=tracks)
+        assert verdict.shutter == shutter
+    assert verdict.reasons == (
+        f"Only {rec.image_names[3]} would show a shutter, and most of what that shows contradicts the rest or itself.",
+    )
+    assert verdict.lens_only == tuple(rec.image_names)
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.5, "50 % of its measurements"), (0.1, "only 24 measurements")])
+def test_photos_of_few_measurements_are_named_without_a_shutter_too(rng, share, said):
+    rec = measured(rng, np.zeros((8, 3)))
+    result = bundle_adjust(with_few_of(rec, 3, share), "global")
+    verdict = judge(result, None, choice_of(), tracks=rec)
+    assert [*verdict.doubtful] == [rec.image_names[3]]
+    assert said in verdict.doubtful[rec.image_names[3]]
+
+
+def test_what_a_lens_of_another_model_bends_is_no_shutter(rng, monkeypatch):
+    result = bundle_adjust(measured(rng, swung(rng)), "rotation")
+    assert judge(result, None, choice_of("rotation", gain=9.0)).shutter == "found"
+    monkeypatch.setitem(judge.__globals__, "excess_px", lambda _: 0.6)
+    verdict = judge(result, None, choice_of("rotation", gain=9.0))
+    assert verdict.shutter == "not-determined"
+    assert 'of a fisheye, say "lens": "fisheye" in camera.json' in verdict.reasons[0]
+    # a gyroscope may say so, too
+    known = KnownMotions(gain=5.0, is_better=True, free_gain=0.0, miss=1.0, size=20.0)
+    assert judge(result, None, replace(choice_of("rotation", gain=9.0), known_motions=known)).shutter == "found"
+
+
 def test_motions_that_repeat_themselves_are_no_hands(rng):
     alike = named(measured(rng, swung(rng, 0.001) + ROLL))[1]
     assert alike.shutter == "not-determined"
@@ -280,7 +321,7 @@ def test_a_photo_of_few_measurements_is_doubtful(rng):
     rec = measured(rng, swung(rng))
     mine = rec.observations.frame_idx == 2
     few = thinned(rec, 2, mine & (np.cumsum(mine) <= 25))
-    assert named(few)[1].doubtful["2.jpg"].startswith("only 25 measurements")
+    assert named(few)[1].doubtful["2.jpg"].startswith("only 24 measurements")
     corner = thinned(rec, 2, (rec.observations.xy_raw < [250, 220]).all(1))
     assert "of its frame" in named(corner)[1].doubtful["2.jpg"]
 

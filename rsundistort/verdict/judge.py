@@ -27,6 +27,7 @@ __all__ = ["UNSEEN_PX", "Verdict", "height_reasons", "judge", "loose_reasons", "
 
 #: Displacements below this are lost in the interpolation of a photo.
 UNSEEN_PX = 1.0
+_IF_FISHEYE = ' (of a fisheye, say "lens": "fisheye" in camera.json)'
 # A motion with a larger standard deviation may do as much harm as good.
 _UNCERTAIN_PX = 2.0
 # Of the scene's height: as good as photos measure. No standard deviation includes errors that all photos share
@@ -250,9 +251,10 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
             "motion during the readout, does not fit."
         )
     if (size := max(map(excess_px, result.reconstruction.cameras))) > 0:
+        pinhole = any(each.lens == "pinhole" and excess_px(each) > 0 for each in result.reconstruction.cameras)
         reasons.append(
             f"The photos deviate from the lens model by {size:.1f} px in the mean, more than any lens of its kind: it "
-            "is not the model of this lens."
+            f"is not the model of this lens{_IF_FISHEYE if pinhole else ''}."
         )
     if choice is not None:
         if choice.restless:
@@ -369,6 +371,8 @@ def _of_motions(
         )
     by_known = None if choice is None else choice.known_motions
     measured = by_known is not None and by_known.is_better
+    if choice is not None and not measured and any(map(excess_px, rec.cameras)):
+        reasons.append("What bends the photos may be their lens.")
     if 2 * torn.sum() > rec.num_images and not measured:
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
     elif (torn & ~np.isin(rec.image_names, [*known]))[seen].all() and not measured:

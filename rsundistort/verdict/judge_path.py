@@ -185,6 +185,8 @@ def _contradictions(
 def _is_outside(time: ReadoutTime, halves: tuple[ReadoutTime, ReadoutTime]) -> bool:
     """Whether a readout time is not that of its halves together, as it is where all fit the same path."""
     weights = np.array([each.sigma for each in halves]) ** -2.0
+    if not weights.sum() > 0:
+        return False
     mean = float(np.average([each.seconds for each in halves], weights=weights))
     return bool(abs(time.seconds - mean) > SIGMAS * max(time.sigma, float(weights.sum()) ** -0.5))
 
