@@ -7,12 +7,13 @@ Renders clips of each kind and prints one JSON object a line: how strong the shu
     walk    a walk with a hand's tremor, from gentle to wild; readout 0.2 to 0.9 of the frame's time
     level   the same, held level at all times: all y axes are parallel
     pan     from a tripod, so that there is no parallax
+    arm     a pan at arm's length, by who turns around: the camera travels on an arc
     two     two frames while the camera rotates by 2 to 4 degrees a readout
     street  a walk along a street, of a phone's or an action camera's 854x480; at 1.2 m a second
     round   the same size, round a thing again and again, as who scans it: once in ten seconds, each time at another
             height and distance; at least 300 frames, so that all of the yard is seen
     vibrating  a walk that shakes at up to 24 Hz, with 30 frames a second
-    gimbal  three seconds along a street, level and without any tremor, while the camera yaws to and fro. The last four
+    gimbal  three seconds along a street, level and without any tremor, while the camera yaws to and fro. The last five
             only if asked for
 """
 
@@ -31,7 +32,7 @@ from rsundistort import read_solution
 from rsundistort.simulate import SceneOptions, simulate_scene
 
 SHORT = ("walk", "level", "pan", "two")
-KINDS = (*SHORT, "street", "round", "vibrating", "gimbal")
+KINDS = (*SHORT, "street", "round", "vibrating", "gimbal", "arm")
 WIDTH, HEIGHT, FOCAL_PX = 640, 360, 500.0
 # 4 samples a pixel: a frame is 41 dB from one of 64, which is less than its noise would be; 16 take three times as long
 SAMPLES = 4
@@ -225,6 +226,13 @@ def path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str, Any]
             for yaw, pitch, roll in zip(turn, pitches, rolls, strict=True)
         ]
         return {**entry, "kind": "pan", "center_w": center, "tremor": tremor, "way": way}
+    if kind == "arm":
+        turn = np.linspace(-0.5, 0.5, 7) * side * rng.uniform(0.6, 1.0)
+        ahead = np.column_stack([np.sin(turn), np.cos(turn), np.zeros(7)])
+        arc = [rng.uniform(-2, 2), 0.3, 1.6] + rng.uniform(0.3, 0.6) * ahead
+        pitch = float(pitches[0])
+        way = [{"center_w": c.tolist(), "look_at_w": look(c, yaw, pitch)} for c, yaw in zip(arc, turn, strict=True)]
+        return {**entry, "kind": "walk", "tremor": tremor | {"travel_m": 0.005}, "way": way}
     length = 1.2 * num_frames / 30
     places = np.column_stack([
         side * np.linspace(-length / 2, length / 2, 4) + rng.uniform(-1, 1),

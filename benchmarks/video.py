@@ -13,6 +13,7 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     two      two frames whose readout time is known: how far off the corrected positions are
     readout  random walks, gentle to wild: errors of the readout time, and these over their standard deviations
     vibrating  likewise walks that shake at up to 24 Hz, faster than frames can show
+    arm        likewise pans at arm's length, by who turns around
     gimbal     likewise level cameras without any tremor, along a street, that yaw to and fro
     stabilised  walks, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
     edited   random walks as programs, lamps and passers-by leave them (`edited.py`): readout times, by the path and by
@@ -95,6 +96,7 @@ PARTS = (
     "readout",
     "vibrating",
     "gimbal",
+    "arm",
     "stabilised",
     "edited",
     "gopro",
@@ -300,7 +302,7 @@ def of_kind(kind: str, args: argparse.Namespace) -> list[dict[str, Any]]:
             values.append({"error": str(error)})
             continue
         value = judged(folder, solved, cpu_s)
-        if kind in ("pan", "walk", "vibrating", "gimbal"):
+        if kind in ("pan", "walk", "vibrating", "gimbal", "arm"):
             value |= against_references(folder / "clip.mp4", solved)
         if kind == "two":
             value |= positions(folder, solved)
@@ -524,6 +526,7 @@ def main() -> None:
                 "length": length, "unordered": unordered, "edited": edits,
                 "vibrating": partial(readout, kind="vibrating"),
                 "gimbal": partial(readout, kind="gimbal"),
+                "arm": partial(readout, kind="arm"),
             }[part](args)  # fmt: skip
 
 

@@ -49,6 +49,8 @@ _LEAST_MEASUREMENTS = 15
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
 # Error that the flow has itself, where nothing else is left.
 _EXACT_PX = 0.125
+# Share of the error of frames that are taken for stabilised which their shutter leaves, if it was that.
+_MOST_OF_IT = 0.5
 # Times that error after a first adjustment, which knows neither the rotations' size nor the readout.
 _AT_FIRST = 4.0
 # A scene is one if rotations leave of its measurements so many times what it leaves, by this quantile, and if it has
@@ -449,18 +451,19 @@ def _first_path(
     clip, path = with_gaps(clip, path, whole, own)
     path, filmed = as_filmed(clip, whole, path, telemetry, own)
     by_lens = _with_known_lens if matched.calibrated else _with_unknown_lens
-    if was_stabilised(filmed):
-        # so are lines that rotate by more than a scene without a shutter, whose points they bend, can show
-        better = by_lens(whole, _at_first(replace(options_of(whole), path=said[1])), log).reconstruction
-        with_shutter = own_motions(better)
-        other_clip, other_path = with_gaps(*said, better, with_shutter)
-        other_path, other = as_filmed(other_clip, better, other_path, telemetry, with_shutter)
-        if not was_stabilised(other):
-            clip, path, filmed, whole, own = other_clip, other_path, other, better, with_shutter
     held = path if was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
     options = replace(options_of(whole), path=held)
     result = by_lens(whole, _at_first(options), log)
-    if held.held_sigma:
+    if was_stabilised(filmed) and result.sigma_px > _EXACT_PX:
+        # so look lines that rotate by more than points show that a scene without a shutter bent, too
+        free = by_lens(whole, _at_first(replace(options, path=said[1])), log)
+        better, own = free.reconstruction, own_motions(free.reconstruction)
+        timed, of_times = with_gaps(*said, better, own)
+        of_times, other = as_filmed(timed, better, of_times, telemetry, own)
+        if not was_stabilised(other) and _explains_it(free, result, clip.frame_s):
+            clip, path, filmed, options = timed, of_times, other, replace(options, path=of_times)
+            result = free if of_times is said[1] else by_lens(better, _at_first(options), log)
+    elif held.held_sigma:
         # what a rough scene shows, and no path follows, a better one may not
         free = by_lens(whole, _at_first(replace(options, path=path)), log)
         own = own_motions(free.reconstruction)
@@ -468,6 +471,12 @@ def _first_path(
             options, result = replace(options, path=path), free
     _end_path(log, "path", clip, whole, result)
     return _TravelledPath(clip, path, options, filmed, result, scene, followed)
+
+
+def _explains_it(free: BundleResult, at_once: BundleResult, frame_s: float) -> bool:
+    """Whether a shutter explains most of what frames show that are taken for stabilised, by a readout that can be."""
+    assert free.path is not None
+    return free.sigma_px < _MOST_OF_IT * at_once.sigma_px and abs(float(free.path.unbounded_s[0])) < frame_s
 
 
 def _path_again(
