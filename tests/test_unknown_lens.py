@@ -55,7 +55,10 @@ def test_a_lens_that_zooms_varies_where_its_focal_length_is_wrong_too():
 
 
 def of_lens(f):
-    return SimpleNamespace(cameras=[Camera(64, 48, np.diag([f, f, 1.0]))], num_images=8)
+    return SimpleNamespace(cameras=[Camera(64, 48, np.diag([f, f, 1.0]))], num_images=8, image_names=())
+
+
+CLIP = SimpleNamespace(frame_s=0.04, are_keys=lambda names: [True for _ in names])
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ def clip_of(monkeypatch):
 
         def path(f, sigma_px, readout_s=0.01):
             result = SimpleNamespace(reconstruction=of_lens(f), sigma_px=sigma_px, readout=ReadoutTime(readout_s, 1e-5))
-            return SimpleNamespace(clip=None, result=result, options=None, filmed=None)
+            result.of_photos = lambda _: result
+            return SimpleNamespace(clip=CLIP, result=result, options=None, filmed=None)
 
         monkeypatch.setattr(video_path, "map_key_frames", map_again)
         monkeypatch.setattr(video_path, "_first_path", lambda *_: path(*next(firsts)))
@@ -94,8 +98,10 @@ def clip_of(monkeypatch):
 
         monkeypatch.setattr(video_path, "_path_again", again)
         monkeypatch.setattr(video_path, "readout_of", lambda result: result.readout)
+        monkeypatch.setattr(video_path, "read_num_verified", lambda _: {})
+        monkeypatch.setattr(video_path, "share_that_fits", lambda *_: 1.0)
         placed = of_lens(500.0), Matches(calibrated)
-        found = _travelled(SimpleNamespace(frame_s=0.04), None, None, StageLog(None), None, lambda: placed)
+        found = _travelled(CLIP, None, None, StageLog(None), None, lambda: placed)
         assert not [*firsts], "a path was not asked for"
         assert not [*lasts], "an adjustment was not asked for"
         return by, found.result.reconstruction.cameras[0].K[0, 0]
