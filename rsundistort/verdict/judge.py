@@ -147,10 +147,7 @@ def judge(
         shutter, why = _of_global(result, choice, options)
         doubts = _of_measurements(rec, _outliers(rec, tracks))
         left = bool(unexplained) or (choice is not None and bool(choice.against))
-        for name, said in _misplaced(result, left).items() if strong else ():
-            doubts[name].append(said)
-        for name in suspects:
-            doubts[name].append(_SUSPECT)
+        _doubt_poses(doubts, _misplaced(result, left) if strong else {}, suspects)
         return _verdict(shutter, reasons + why, _texts(doubts))
     given = options or BundleOptions()
     known = {*given.known_phi, *given.held_phi, *given.still}
@@ -164,10 +161,7 @@ def judge(
     unsupported &= ~np.isin(rec.image_names, [*known])
     shutter, why = _of_motions(result, global_result, choice, motions, torn, unsupported, known, options)
     reasons += _rival_reasons(choice)
-    for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
-        doubts[name].append(said)
-    for name in suspects:
-        doubts[name].append(_SUSPECT)
+    _doubt_poses(doubts, _misplaced(result, bool(unexplained + why)) if strong else {}, suspects)
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
@@ -494,6 +488,14 @@ def _of_measurements(rec: Reconstruction, outliers: Array) -> dict[str, list[str
         if outliers[i] > _OUTLIERS:
             said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
     return doubts
+
+
+def _doubt_poses(doubts: dict[str, list[str]], misplaced: Mapping[str, str], suspects: Collection[str]) -> None:
+    """Add reasons against the poses of photos."""
+    for name, said in misplaced.items():
+        doubts[name].append(said)
+    for name in suspects:
+        doubts[name].append(_SUSPECT)
 
 
 def _texts(doubts: Mapping[str, list[str]]) -> dict[str, str]:

@@ -96,11 +96,7 @@ def judge_clip(
     unbounded_s = float(result.path.unbounded_s[0])
     reasons = loose_reasons(keys, scaled=True) + height_reasons(remedy) + unexplained_reasons(keys, None)
     rec = keys.reconstruction
-    shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
-    # travel displaces what is near
-    moved, valid = shutter_displacements(rec)
-    if valid.any():
-        shift = max(shift, float(np.quantile(np.linalg.norm(moved[valid], axis=1), _SHARE_SHOWN)))
+    shift = _shift_px(rec)
     most = shift * (abs(time.seconds) + SIGMAS * time.sigma) / max(abs(time.seconds), 1e-9)
     if against:
         return Verdict(
@@ -126,6 +122,24 @@ def judge_clip(
         )
     if shutter != "not-found":  # what displaces nothing contradicts nothing
         reasons += _contradictions(time, vibration_px, speeds, halves)
+    reasons += _of_poses(rec, rotation_ratio, share_that_fits, travel_px)
+    lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
+    return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
+
+
+def _shift_px(rec: Reconstruction) -> float:
+    """By how much the shutter displaces pixels, the most of all frames."""
+    shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
+    # travel displaces what is near
+    moved, valid = shutter_displacements(rec)
+    if valid.any():
+        shift = max(shift, float(np.quantile(np.linalg.norm(moved[valid], axis=1), _SHARE_SHOWN)))
+    return shift
+
+
+def _of_poses(rec: Reconstruction, rotation_ratio: float, share_that_fits: float, travel_px: float) -> list[str]:
+    """Why the poses of the frames may be wrong."""
+    reasons = []
     if abs(np.log(rotation_ratio)) > _GYRO_SCALE:
         reasons.append(
             f"The frames rotate {rotation_ratio:.2f} times as far as the gyroscope: by it the focal length is "
@@ -141,8 +155,7 @@ def judge_clip(
             f"The camera travelled, too: rotations leave {travel_px:.1f} px of what frames far apart share. The focal "
             "length and the rotations may be wrong by some percent."
         )
-    lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
-    return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
+    return reasons
 
 
 def _contradictions(
