@@ -375,6 +375,23 @@ def test_stray_points_are_not_believed_and_edges_are(rng):
     np.testing.assert_allclose(made.depth[2:-2, u > 125], 10.0, rtol=1e-5)
 
 
+def test_false_points_of_two_photos_that_agree_with_each_other_are_not_believed(rng):
+    # matches off by one period of a wall's tiles: near, all alike, and side by side
+    xy = rng.uniform([0, 0], [W, H], (600, 2))
+    depth = 10.0 + 0.01 * xy[:, 0]
+    falsely = np.argsort(np.hypot(*(xy - [60, 80]).T))[:6]
+    seen = depth.copy()
+    seen[falsely] = 2.0
+    num_photos = np.where(rng.random(600) < 0.2, 2, 5)
+    num_photos[falsely] = 2
+    assert depth_from_points(xy, seen, (W, H)).depth.min() < 3
+    assert depth_from_points(xy, seen, (W, H), num_photos).depth.min() > 9.5
+    # a near thing that three photos saw stays, and where hardly a point is seen in three, two have to do
+    near = np.where(np.isin(np.arange(600), falsely), 3, num_photos)
+    assert depth_from_points(xy, seen, (W, H), near).depth.min() < 3
+    assert depth_from_points(xy, seen, (W, H), np.full(600, 2)).depth.min() < 3
+
+
 @pytest.mark.parametrize("num", [1, 2, 3, 5])
 def test_few_points_and_points_on_a_line_still_make_a_map(num):
     xy = np.column_stack([np.linspace(20, 150, num), np.full(num, 70.0)])

@@ -53,15 +53,19 @@ class ScenePoints:
         World frame of the solution.
     seen : mapping of photo name to index array
         Points that a photo measured.
+    num_photos : (n,) index array
+        How many photos measured each point, whether or not they are in `seen`.
     """
 
     points_w: Array
     seen: Mapping[str, Index]
+    num_photos: Index
 
     @classmethod
     def of_reconstruction(cls, rec: Reconstruction) -> ScenePoints:
         """Points of a reconstruction."""
-        return cls(rec.points_w, _by_photo(rec.image_names, rec.observations.frame_idx, rec.observations.point_idx))
+        seen = _by_photo(rec.image_names, rec.observations.frame_idx, rec.observations.point_idx)
+        return cls(rec.points_w, seen, _num_photos(seen, len(rec.points_w)))
 
     @classmethod
     def of_colmap_model(cls, folder: Path, names: Sequence[str], raw_as: str) -> ScenePoints:
@@ -69,7 +73,8 @@ class ScenePoints:
         _, written, _, _, _, points_w, frame_idx, point_idx = read_colmap_poses(folder)
         seen = _by_photo(written, frame_idx, point_idx)
         mine = {name: seen.get(output_name(name, raw_as)) for name in names}
-        return cls(points_w, {name: points for name, points in mine.items() if points is not None})
+        mine_only = {name: points for name, points in mine.items() if points is not None}
+        return cls(points_w, mine_only, _num_photos(seen, len(points_w)))
 
 
 def _by_photo(names: Sequence[str], frame_idx: Index, point_idx: Index) -> dict[str, Index]:
@@ -78,12 +83,21 @@ def _by_photo(names: Sequence[str], frame_idx: Index, point_idx: Index) -> dict[
     return {name: np.unique(point_idx[order[bounds[i] : bounds[i + 1]]]) for i, name in enumerate(names)}
 
 
+def _num_photos(seen: Mapping[str, Index], num_points: int) -> Index:
+    """(num_points,) photos that measured each point."""
+    num = np.zeros(num_points, np.int64)
+    for points in seen.values():
+        num[points] += 1
+    return num
+
+
 class _Seen(NamedTuple):
-    """Points that a photo measured: rectified pixels (n, 2), directions (n, 3) of z = 1, depths (n,)."""
+    """Points that a photo measured: rectified pixels (n, 2), directions (n, 3) of z = 1, depths, and by how many."""
 
     xy: Array
     rays_c: Array
     depth: Array
+    num_photos: Index
 
 
 @dataclass(frozen=True)
@@ -131,6 +145,8 @@ class PhotoGeometry:
         rectified at infinity.
     points_c : (n, 3) array or None
         Points that the photo measured.
+    num_photos : (n,) index array or None
+        How many photos measured each of them.
     plane : Plane or None
         The plane nearest to most points of the scene.
     own_map : Path or None
@@ -144,6 +160,7 @@ class PhotoGeometry:
     shutter_model: str
     how: str | None = None
     points_c: Array | None = None
+    num_photos: Index | None = None
     plane: Plane | None = None
     own_map: Path | None = None
 
@@ -171,20 +188,23 @@ class PhotoGeometry:
             return self._own_map(size, seen)
         plane = self.plane
         if plane is not None and self.how == "auto" and seen is not None:
-            plane = plane if prefers_plane(plane, *seen, size) else None
+            plane = plane if prefers_plane(plane, seen.xy, seen.rays_c, seen.depth, size, seen.num_photos) else None
         if plane is not None:
             return plane, "plane"
         if seen is not None and self.how in ("auto", "points"):
-            return depth_from_points(seen.xy, seen.depth, size), "points"
+            return depth_from_points(seen.xy, seen.depth, size, seen.num_photos), "points"
         return AtInfinity(), "infinity"
 
     def _seen(self) -> _Seen | None:
-        if self.points_c is None:
+        if self.points_c is None or self.num_photos is None:
             return None
         K = self.new_camera.K
-        X_c = self.points_c[self.points_c[:, 2] > 0]
+        before = self.points_c[:, 2] > 0
+        X_c = self.points_c[before]
         rays = X_c / X_c[:, 2:]
-        return _Seen(rays[:, :2] @ K[:2, :2].T + K[:2, 2], rays, X_c[:, 2]) if len(X_c) else None
+        if not len(X_c):
+            return None
+        return _Seen(rays[:, :2] @ K[:2, :2].T + K[:2, 2], rays, X_c[:, 2], self.num_photos[before])
 
     def _own_map(self, size: tuple[int, int], seen: _Seen | None) -> tuple[Depth, str]:
         path = self.own_map
@@ -254,14 +274,15 @@ class SceneGeometry:
         R_cw, center_w = image.R_cw, image.center_w
         assert R_cw is not None
         assert center_w is not None
-        points_c = None
+        points_c, num_photos = None, None
         if self._points is not None:
             seen = self._points.seen.get(name, np.zeros(0, np.int64))
             points_c = (self._points.points_w[seen] - center_w) @ R_cw.T
+            num_photos = self._points.num_photos[seen]
         plane = None if self._plane is None else plane_in_camera(*self._plane, R_cw, center_w)
         return PhotoGeometry(
-            name, *cameras, motion.in_camera(R_cw), solution.shutter_model, self._how, points_c, plane,
-            self._maps.get(name),
+            name, *cameras, motion.in_camera(R_cw), solution.shutter_model, self._how, points_c, num_photos,
+            plane, self._maps.get(name),
         )  # fmt: skip
 
 

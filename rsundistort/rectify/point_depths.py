@@ -9,7 +9,7 @@ import numpy as np
 from .._kernels import depth as kernels
 from ..errors import InputError
 from ..model import DepthMap, Plane
-from ..model.array_types import Array, Mask
+from ..model.array_types import Array, Index, Mask
 from .pixel_depths import inverse_depth_at
 
 __all__ = ["depth_from_points", "fit_plane", "plane_in_camera", "prefers_plane"]
@@ -19,6 +19,9 @@ __all__ = ["depth_from_points", "fit_plane", "plane_in_camera", "prefers_plane"]
 _NEIGHBOURS = 8
 _SUPPORT = 2
 _SHARE = 0.1
+# So many photos confirm a point. Two fit any match along the epipolar line, and false ones by a period of what repeats
+# agree with each other; if this share of a photo's points is confirmed, only these are asked.
+_CONFIRMING, _CONFIRMED_SHARE = 3, 0.5
 # The map has at most this many cells along the longer side, none smaller than this many pixels: a photo has a few
 # thousand points, and finer cells gained nothing (benchmarks/depth.py).
 _MAX_CELLS = 96
@@ -26,18 +29,24 @@ _CELL_PX = 6
 _NUM_TRIPLES = 500
 
 
-def _believed(xy: Array, inverse: Array) -> Mask:
+def _believed(xy: Array, inverse: Array, num_photos: Index | None) -> Mask:
     """(n,) points that agree with neighbours."""
     from scipy.spatial import cKDTree
 
-    num = min(_NEIGHBOURS + 1, len(xy))
+    everybody = np.ones(len(xy), bool)
+    asked = everybody if num_photos is None else num_photos >= _CONFIRMING
+    if asked.mean() < _CONFIRMED_SHARE:
+        asked = everybody
+    num = min(_NEIGHBOURS + 1, int(asked.sum()))
     if num <= _SUPPORT:
-        return np.ones(len(xy), bool)
-    neighbours = np.asarray(cKDTree(xy).query(xy, k=num)[1])[:, 1:]
+        return everybody
+    nearest = np.asarray(cKDTree(xy[asked]).query(xy, k=num)[1])
+    # the nearest one of those asked is the point itself
+    neighbours = np.flatnonzero(asked)[np.where(asked[:, None], nearest[:, 1:], nearest[:, :-1])]
     apart = np.abs(inverse[neighbours] - inverse[:, None])
     tolerance = _SHARE * np.maximum(inverse, np.median(inverse))[:, None]
     believed = (apart < tolerance).sum(1) >= _SUPPORT
-    return believed if believed.any() else np.ones(len(xy), bool)
+    return believed if believed.any() else everybody
 
 
 def _interpolate(xy: Array, inverse: Array, size: tuple[int, int]) -> Array:
@@ -58,11 +67,12 @@ def _interpolate(xy: Array, inverse: Array, size: tuple[int, int]) -> Array:
     return field
 
 
-def depth_from_points(xy: Array, depth: Array, size: tuple[int, int]) -> DepthMap:
+def depth_from_points(xy: Array, depth: Array, size: tuple[int, int], num_photos: Index | None = None) -> DepthMap:
     """A coarse depth map of a photo from the depths of some points.
 
     Inverse depth is interpolated linearly in the Delaunay triangles between the points, and is that of the nearest
-    point beyond them. Points that fewer than two of their eight neighbours agree with are left out.
+    point beyond them. Points that fewer than two of their eight neighbours agree with are left out; where most points
+    are seen in three photos, neighbours of two are not asked.
 
     Parameters
     ----------
@@ -72,6 +82,8 @@ def depth_from_points(xy: Array, depth: Array, size: tuple[int, int]) -> DepthMa
         z in the frame of the rectified camera; positive.
     size : (width, height)
         Of the rectified photo.
+    num_photos : (n,) index array, optional
+        How many photos measured each point; three at least when left out.
 
     Examples
     --------
@@ -81,7 +93,7 @@ def depth_from_points(xy: Array, depth: Array, size: tuple[int, int]) -> DepthMa
     if not len(xy):
         raise InputError("no point to take depths from")
     inverse = 1.0 / depth
-    believed = _believed(xy, inverse)
+    believed = _believed(xy, inverse, num_photos)
     smooth = _interpolate(xy[believed], inverse[believed], size)
     return DepthMap((1.0 / smooth).astype(np.float32), size)
 
@@ -121,20 +133,27 @@ def plane_in_camera(normal_w: Array, offset: float, R_cw: Array, center_w: Array
     return Plane(R_cw @ normal_w * np.sign(distance), abs(distance))
 
 
-def prefers_plane(plane: Plane, xy: Array, rays_c: Array, depth: Array, size: tuple[int, int]) -> bool:
+def prefers_plane(
+    plane: Plane,
+    xy: Array,
+    rays_c: Array,
+    depth: Array,
+    size: tuple[int, int],
+    num_photos: Index | None = None,
+) -> bool:
     """Whether a plane predicts the depths of half of the points at least as well as a map of the other half does.
 
     Parameters
     ----------
     plane : Plane
         In the camera frame.
-    xy, depth, size
+    xy, depth, size, num_photos
         As in `depth_from_points`.
     rays_c : (n, 3) array
         Directions of the points in the camera frame, of z = 1.
     """
     inverse = 1.0 / depth
-    believed = np.flatnonzero(_believed(xy, inverse))
+    believed = np.flatnonzero(_believed(xy, inverse, num_photos))
     fitted, held = believed[::2], believed[1::2]
     if not len(held):
         return True
