@@ -2,11 +2,14 @@
 
     python benchmarks/unknown_camera.py [--photos DIR] [--names herz-jesus-8 iphone6 phone dslr drone lund]
                                         [--clips DIR [--kinds walk vibrating] [--seeds 100 101 ...]]
+                                        [--lenses [--scenes courtyard colonnade]]
 
 `f_reference` is that of `camera.json`, or what a run finds that has the EXIF. `f_pairs` is what pairs of photos say
 before anything is mapped, with its relative standard deviation, and `f` what the run ends with. `walk` of the sample
 scenes is a video without its camera file: `readout_ms` should be 20. With `--clips` only `f_pairs` of random clips
-(`clips.py`) is shown, and at the end the root mean square of its relative errors, and the largest.
+(`clips.py`) is shown, and at the end the root mean square of its relative errors, and the largest. With `--lenses` the
+sample scenes are rendered again by wide lenses, a fisheye and a pinhole, with their shutter and without, and solved
+without a camera.
 """
 
 from __future__ import annotations
@@ -23,15 +26,19 @@ import cv2
 import numpy as np
 from clips import clip_folder
 
-from rsundistort import RsUndistortWarning, RunOptions, Solution, run
+from rsundistort import RsUndistortWarning, RunOptions, Solution, evaluate, run
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.input.key_frames import read_clip
 from rsundistort.input.load import load_photos
 from rsundistort.input.unknown_focal import with_focal_lengths
+from rsundistort.simulate import SceneOptions, simulate_scene
 from rsundistort.solve import OutputOptions
 
 ROOT = Path(__file__).resolve().parent.parent
+# The focal length is that of an action camera, 90 degrees from border to border of the pinhole's photo; a share of it.
+_WIDE = {"fisheye": [0.02, -0.005, 0.001, -0.0005], "pinhole": [-0.02, 0.01, 0.0, 0.0, 0.0]}
+_WIDE_F = {"fisheye": 0.45, "pinhole": 0.5}
 
 
 def solved(photos: Path, out: Path, camera: str | None = None) -> Solution:
@@ -86,6 +93,33 @@ def of_clips(folder: Path, kinds: list[str], seeds: list[int]) -> None:
     )
 
 
+def of_lenses(work: Path, scenes: list[str]) -> None:
+    """Scenes as wide lenses show them."""
+    for scene, (lens, dist), share in product(scenes, _WIDE.items(), (1.0, 0.0)):
+        recipe = json.loads((ROOT / "sample_scenes" / scene / "recipe.json").read_text())
+        camera, folder = recipe["camera"], work / f"{scene}-{lens}-{share:.0f}"
+        f = _WIDE_F[lens] * camera["width"]
+        camera |= {"K": [[f, 0, camera["K"][0][2]], [0, f, camera["K"][1][2]], [0, 0, 1]], "dist": dist, "lens": lens}
+        motion = recipe["motion"].items()
+        recipe["motion"] = {key: share * value if key.endswith("_per_frame") else value for key, value in motion}
+        folder.mkdir()
+        (folder / "recipe.json").write_text(json.dumps(recipe))
+        simulate_scene(folder / "recipe.json", folder / "scene", SceneOptions(depth=False))
+        (folder / "scene" / "camera.json").unlink()
+        solution = solved(folder / "scene" / "photos", folder / "out")
+        result = evaluate(folder / "out", folder / "scene" / "ground_truth.json")
+        found = {
+            "name": f"{scene}, {lens}, {'as it is' if share else 'no shutter'}",
+            "lens": solution.cameras[solution.registered[0].camera_id].lens,
+            "f_ratio": round(focal(solution) / f, 5),
+            "registered": result.registered,
+            "rotation_deg": round(result.rotation_deg.median, 4),
+            "psnr_db": round(result.psnr_db.median, 2),
+            "verdict": solution.verdict,
+        }
+        print(json.dumps(found), flush=True)
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -94,7 +128,13 @@ def main() -> None:
     parser.add_argument("--clips", type=Path)
     parser.add_argument("--kinds", nargs="+", default=["walk", "vibrating"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[*range(100, 108)])
+    parser.add_argument("--lenses", action="store_true")
+    parser.add_argument("--scenes", nargs="+", default=["courtyard", "colonnade"])
     args = parser.parse_args()
+    if args.lenses:
+        with tempfile.TemporaryDirectory() as folder:
+            of_lenses(Path(folder), args.scenes)
+        return
     if args.clips is not None:
         of_clips(args.clips, args.kinds, args.seeds)
         return

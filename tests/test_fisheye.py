@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from make_photos import COURTYARD
+from scipy.optimize import least_squares
 
 from rsundistort import (
     Camera,
     RowMotion,
+    RsUndistortWarning,
     RunOptions,
     SolveOptions,
     evaluate,
@@ -22,6 +25,8 @@ from rsundistort import (
 )
 from rsundistort.colmap.lenses import camera_to_colmap, refined_camera
 from rsundistort.errors import InputError
+from rsundistort.input.fisheyes import cameras_as_fisheyes, fisheye_apart_px
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.model.projection import project_points
 from rsundistort.sfm import Features
 from rsundistort.sfm.database import ideal_keypoints
@@ -129,3 +134,80 @@ def test_run_on_photos_of_a_fisheye(tmp_path):
     assert found.lens == "fisheye"
     assert found.K[0, 0] == pytest.approx(200, rel=5e-3)
     np.testing.assert_allclose(found.dist[:2], [0.03, -0.012], atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("equivalent_mm", "width", "is_apart"), [(28, 4000, False), (24, 4000, False), (18, 1024, True), (15, 1024, True)]
+)
+def test_a_fisheye_is_no_pinhole_lens_where_the_view_is_wide(equivalent_mm, width, is_apart):
+    size = np.array([width, 0.75 * width])
+    f = equivalent_mm * np.hypot(*size) / 43.27
+    K = [[f, 0, size[0] / 2 - 0.5], [0, f, size[1] / 2 - 0.5], [0, 0, 1]]
+    assert (fisheye_apart_px(Camera(width, round(0.75 * width), K)) > 0.5) == is_apart
+
+
+def test_pixels_by_which_a_fisheye_is_apart_are_those_of_a_lens_that_is_fitted():
+    K = [[532.0, 0, 511.5], [0, 532.0, 383.5], [0, 0, 1]]
+    wide = Camera(1024, 768, K, lens="fisheye")
+    xy = np.stack(np.meshgrid(np.linspace(15, 1008, 33), np.linspace(11, 756, 33)), -1).reshape(-1, 2)
+    rays = cv2.fisheye.undistortPoints(xy[None], wide.K, np.zeros(4))[0]
+
+    def error_px(p):
+        K = np.array([[p[0], 0, 511.5], [0, p[0], 383.5], [0, 0, 1]])
+        dist = np.array([p[1], p[2], 0, 0, p[3]])
+        return (
+            cv2.projectPoints(np.c_[rays, np.ones(len(rays))], np.zeros(3), np.zeros(3), K, dist)[0][:, 0] - xy
+        ).ravel()
+
+    fitted = least_squares(error_px, [532.0, -0.3, 0.1, -0.01], x_scale=[100, 0.1, 0.1, 0.01])
+    rms_px = np.sqrt((fitted.fun.reshape(-1, 2) ** 2).sum(1).mean())
+    assert fisheye_apart_px(wide) == pytest.approx(rms_px, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("f", "is_doubtful", "bends_px", "becomes_one"),
+    [
+        (460, True, 0.0, True),  # nothing explains a view this wide
+        (460, False, 0.1, True),  # it needs a residual field
+        (460, False, 0.0, False),  # a pinhole lens explains it
+        (900, True, 0.1, False),  # a fisheye of so narrow a view is a pinhole lens
+        (900, False, 3.0, True),  # no pinhole lens deviates by so much
+    ],
+)
+def test_cameras_of_which_nothing_is_known_become_fisheyes(f, is_doubtful, bends_px, becomes_one):
+    K = np.array([[f, 0, 511.5], [0, f, 383.5], [0, 0, 1]])
+    found = Camera(1024, 768, K + np.array([[1, 0, 2], [0, 1, -3], [0, 0, 0]]), [-0.25, 0.07, 0, 0, -0.01])
+    if bends_px:
+        field = bends_px * np.cos(np.pi * np.arange(8) / 7)[None, :, None] * np.ones((6, 1, 2))
+        found = replace(found, field=field)
+    guess = Camera(1024, 768, K, readout="bottom-to-top")
+    cameras = PhotoCameras((guess,), ("hero",), np.zeros(9, int), False, (False,), "EXIF")
+    other = cameras_as_fisheyes(cameras, [found], is_doubtful)
+    assert (other is not None) == becomes_one
+    if other is not None:
+        assert other[0].cameras == (Camera(1024, 768, found.K, readout="bottom-to-top", lens="fisheye"),)
+        assert other[1] == ["no pinhole lens explains the photos of hero, and a fisheye does: solved as of one"]
+        assert cameras_as_fisheyes(other[0], other[0].cameras, True) is None  # it is one already
+    assert cameras_as_fisheyes(replace(cameras, calibrated=True), [found], is_doubtful) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moves", [True, False])
+def test_photos_of_an_action_camera_that_nobody_described(tmp_path, moves):
+    """A view of 127 degrees across, without a camera file: a pinhole lens, its field and a lens that varies miss it."""
+    recipe = json.loads((COURTYARD / "recipe.json").read_text())
+    recipe["camera"] |= {"K": [[432.0, 0, 486.5], [0, 432, 313.25], [0, 0, 1]], "dist": [0.02, -0.005, 0.001, -0.0005]}
+    recipe["camera"]["lens"] = "fisheye"
+    recipe["motion"]["sigma_rad_per_frame"] *= moves
+    (tmp_path / "recipe.json").write_text(json.dumps(recipe))
+    simulate_scene(tmp_path / "recipe.json", tmp_path / "scene", SceneOptions(depth=False))
+    (tmp_path / "scene" / "camera.json").unlink()
+    with pytest.warns(RsUndistortWarning, match="a fisheye does"):
+        solution = run(tmp_path / "scene" / "photos", tmp_path / "out")
+    (found,) = solution.cameras.values()
+    assert found.lens == "fisheye"
+    assert found.K[0, 0] == pytest.approx(432, rel=5e-4)
+    assert evaluate(tmp_path / "out", tmp_path / "scene" / "ground_truth.json").rotation_deg.median < 0.02
+    assert solution.verdict is not None
+    assert solution.verdict["shutter"] == ("found" if moves else "not-found")
+    assert solution.verdict["shape"] == "trusted"

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .camera import Camera
 
 __all__ = [
+    "MOST_FIELD_PX",
     "add_field",
     "excess_px",
     "field_basis",
@@ -37,8 +38,8 @@ __all__ = [
 _LOOKED_AT = 33
 # Slope of a field; from 1 on a photo may fold.
 _STEEPEST = 0.5
-# Largest field beside a lens model, root mean square over the frame: with more, it is not the model of this lens.
-_MOST_PX = 0.5
+#: Largest field beside a lens model, root mean square over the frame: with more, it is not the model of this lens.
+MOST_FIELD_PX = 0.5
 
 
 def _splines(u: Array, count: int, slope: bool = False) -> Array:
@@ -126,7 +127,7 @@ def add_field(camera: Camera, x: NDArray[np.floating], y: NDArray[np.floating]) 
 def excess_px(camera: Camera) -> float:
     """Root mean square of a camera's field over its frame, if no lens of its kind deviates by so much; else 0."""
     size_px = float(np.sqrt((field_over_frame(camera)[1] ** 2).sum(2).mean()))
-    return size_px if size_px > _MOST_PX else 0.0
+    return size_px if size_px > MOST_FIELD_PX else 0.0
 
 
 def field_over_frame(camera: Camera, across: int = 33, down: int = 25) -> tuple[Array, Array]:

@@ -16,11 +16,12 @@ from ..bundle import BundleOptions
 from ..bundle.intrinsics import check_lenses
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
+from ..input.fisheyes import cameras_as_fisheyes
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_readouts
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos, OtherFeatures, load_photos
-from ..input.photo_cameras import camera_file_of
+from ..input.photo_cameras import PhotoCameras, camera_file_of
 from ..input.unknown_focal import warn_of_weak_focal_lengths, with_focal_lengths
 from ..input.zooms import cameras_by_zoom
 from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
@@ -33,6 +34,7 @@ from ..io.record import Record
 from ..io.video import VIDEO_SUFFIXES, VideoFrames
 from ..model import Reconstruction, Solution
 from ..model.checks import check_kind
+from ..verdict.judge import unexplained_reasons
 from .going_on import RunFolder, key_of, run_folder
 from .known_contradiction import known_contradiction
 from .model_sequence import solve_photos
@@ -57,8 +59,8 @@ from .video_path import frame_path, solve_clip
 
 __all__ = ["check_of_video", "run", "solve_frames"]
 
-# Times that photos are solved again after some of them seem to have another zoom.
-_ZOOM_ROUNDS = 3
+# Times that photos are solved again after some of them seem to have another lens, or another zoom.
+_CAMERA_ROUNDS = 3
 
 
 def run(
@@ -182,7 +184,7 @@ def _solved(
     bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
     if source.clip is None:
         solve = partial(_solve, options, bodies=bodies, gyro_log=gyro_log, workers=workers, log=log)
-        solved, solving, loaded = _by_zoom(solve, loaded, kept)
+        solved, solving, loaded = _by_cameras(solve, loaded, kept)
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
     rec, sigmas = solved.result.reconstruction, solved.result.sigma_intrinsics
@@ -212,31 +214,44 @@ def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) ->
             raise InputError(f"constraint on {name!r}, which is not among the photos of {photos}")
 
 
-def _by_zoom(
+def _by_cameras(
     solve: Callable[..., tuple[Solved, SolveOptions]], loaded: LoadedPhotos, kept: Kept
 ) -> tuple[Solved, SolveOptions, LoadedPhotos]:
-    """The result of the photos; by cameras of their own for those that seem to have another zoom, if it fits better."""
+    """The result of the photos; by other cameras for those that seem to have another lens or zoom, if these fit."""
     told = list[str]()
     with _saying() as said:
         solved, solving = solve(loaded, kept=kept)
-        for _ in range(_ZOOM_ROUNDS):
-            apart = cameras_by_zoom(loaded.cameras, loaded.names, _zooms(solved))
-            if apart is None:
-                break
-            cameras, notes = apart
-            divided, before, other = replace(loaded, cameras=cameras), [*said], None
-            said.clear()
-            # what was mapped before has other cameras: it is not kept
-            with suppress(ReconstructionError, InputError):
-                other, solving_then = solve(divided, kept=Kept())
-            if other is None or not _is_better(other, solved):
-                said[:] = before
-                break
-            solved, solving, loaded = other, solving_then, divided
-            told += notes
+        for other_cameras, is_better in ((_as_fisheyes, _explains_most), (_by_zoom, _is_better)):
+            for _ in range(_CAMERA_ROUNDS):
+                apart = other_cameras(loaded, solved)
+                if apart is None:
+                    break
+                cameras, notes = apart
+                divided, before, other = replace(loaded, cameras=cameras), [*said], None
+                said.clear()
+                # what was mapped before has other cameras: it is not kept
+                with suppress(ReconstructionError, InputError):
+                    other, solving_then = solve(divided, kept=Kept())
+                if other is None or not is_better(other, solved):
+                    said[:] = before
+                    break
+                solved, solving, loaded = other, solving_then, divided
+                told += notes
         for note in told:
             warnings.warn(note, RsUndistortWarning, stacklevel=4)
     return solved, solving, loaded
+
+
+def _as_fisheyes(loaded: LoadedPhotos, solved: Solved) -> tuple[PhotoCameras, list[str]] | None:
+    """Cameras of another lens, as `cameras_as_fisheyes`."""
+    varies = solved.choice is not None and solved.choice.varying
+    is_doubtful = varies or bool(unexplained_reasons(solved.result, solved.choice))
+    return cameras_as_fisheyes(loaded.cameras, solved.shared.cameras, is_doubtful)
+
+
+def _by_zoom(loaded: LoadedPhotos, solved: Solved) -> tuple[PhotoCameras, list[str]] | None:
+    """Cameras of another zoom, as `cameras_by_zoom`."""
+    return cameras_by_zoom(loaded.cameras, loaded.names, _zooms(solved))
 
 
 def _zooms(solved: Solved) -> Mapping[str, float]:
@@ -268,6 +283,11 @@ def _is_better(other: Solved, before: Solved) -> bool:
     """Whether a solution leaves less of as many photos."""
     fewer = len(other.shared.image_names) < len(before.shared.image_names)
     return not fewer and other.result.sigma_px < before.result.sigma_px
+
+
+def _explains_most(other: Solved, before: Solved) -> bool:
+    """Whether a solution explains most of what another leaves of as many photos."""
+    return _is_better(other, before) and 2 * other.result.sigma_px**2 < before.result.sigma_px**2
 
 
 def _solve(
