@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sift_like import sift_like
 
-from rsundistort import Camera, RowMotion, project_points
+from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
+from rsundistort.input.photo_cameras import GUESS_SIGMA
 from rsundistort.model.projection import unproject_points
 from rsundistort.sfm.features import Features
-from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _with_likeliest_lens, seen_again
+from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _with_likeliest_lens, lens_shows_px, seen_again
 
 F = 500.0
 CAMERA = Camera(640, 360, [[F, 0, 320], [0, F, 180], [0, 0, 1]])
@@ -127,3 +128,18 @@ def test_a_pan_by_a_lens_that_nobody_knows_is_one() -> None:
     # a lens that is known is not made another
     known = replace(guess, dist=[-0.05, 0.0, 0.0, 0.0])
     np.testing.assert_array_equal(_with_likeliest_lens(corners, known).dist, known.dist)
+
+
+@pytest.mark.parametrize(
+    ("size_deg", "least", "most"), [(0.0, 0.0, 1e-9), (0.02, 1e-4, 0.05), (1.0, 0.5, 5.0), (40.0, 2.0, 100.0)]
+)
+def test_frames_that_hardly_rotate_show_no_lens(size_deg: float, least: float, most: float) -> None:
+    rng = np.random.default_rng(2)
+    turned = Rotation.from_rotvec(np.radians(size_deg) * rng.uniform(-1, 1, (20, 3))).as_matrix()
+    frames = Reconstruction(
+        [CAMERA], [str(k) for k in range(20)], np.zeros(20, int), turned, np.zeros((20, 3)), np.zeros((0, 3)),
+        Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))),
+    )  # fmt: skip
+    assert least <= lens_shows_px(frames, {**GUESS_SIGMA, "f": 0.28}) <= most
+    # a lens that is known to be this one is no other
+    assert lens_shows_px(frames, {"f": 1e-9}) < 1e-5

@@ -58,6 +58,62 @@ def solve(monkeypatch):
     return solve
 
 
+def test_a_camera_that_hardly_moves_has_no_scene(solve, monkeypatch):
+    """Which is not even looked for."""
+    stands = FoundPath(CLIP, TURNED, BundleOptions(path=replace(PATH, rotation_only=True)), stands=True)
+    solve(None, explained=False, scene=TRAVELLED)
+    monkeypatch.setattr(video_path, "_only_rotated", lambda *_: (stands, "by rotations"))
+    monkeypatch.setattr(video_path, "_travelled", lambda *_: pytest.fail("a scene was looked for"))
+    with pytest.warns(RsUndistortWarning, match="the camera hardly moves"):
+        found = video_path.solve_clip(CLIP, keys_of(Camera(64, 36, np.eye(3))), PATH, None, None, StageLog(None))
+    assert found == TURNED
+
+
+class Still:
+    """A camera on a tripod, that trembles by some degrees."""
+
+    def __init__(self, size_deg):
+        self.size = np.radians(size_deg)
+
+    def rotations(self, time):
+        angle = np.sin(np.outer(np.asarray(time), [7.0, 11.0, 5.0]))
+        return Rotation.from_rotvec(self.size * angle).as_matrix()
+
+    def centers(self, time):
+        return np.zeros((*np.shape(time), 3))
+
+    seed = 4
+
+
+@pytest.mark.parametrize(("size_deg", "stands"), [(0.0, True), (0.02, True), (2.0, False)])
+def test_the_lens_of_a_camera_that_hardly_moves_stays_as_it_is_guessed(monkeypatch, size_deg, stands):
+    """Errors of the flow would say anything of it."""
+    seen, time_s = filmed(Still(size_deg), noise_px=0.1)
+    guess = Camera(640, 480, [[650, 0, 319.5], [0, 650, 239.5], [0, 0, 1]])
+    said = replace(guess, K=[[520, 0, 319.5], [0, 520, 239.5], [0, 0, 1]])
+    start = as_directions(seen, replace(seen, cameras=[said]))
+    monkeypatch.setattr(video_path, "rotating_only", lambda *_: start)
+    clip = SimpleNamespace(
+        names=seen.image_names, time_s=np.arange(30) / 30, frame_s=1 / 30, part=np.zeros(30, int), is_even=True,
+        places=lambda names: np.array([int(name[:6]) for name in names]),
+    )  # fmt: skip
+    cameras = PhotoCameras([guess], ["camera"], np.zeros(30, int), False, (True,), "guessed", (), [{"f": 0.28}], [0])
+    keys = LoadedPhotos(list(seen.image_names), [], [], {}, cameras, {}, Path(), {}, 1.0)
+
+    def options_of(_):
+        return BundleOptions(refine=("f", "k1"), guessed=cameras.known_to(loose=True))
+
+    monkeypatch.setattr(video_path, "with_gaps", lambda clip, path, *_: (clip, path))
+    path = FramePath(time_s, 1 / 30)
+    found, explained = video_path._only_rotated(clip, keys, path, options_of, StageLog(None))
+    assert (found.stands, explained) == (stands, "by rotations")
+    camera = found.result.reconstruction.cameras[0]
+    if stands:
+        assert camera == guess
+    else:
+        assert abs(camera.K[0, 0] - 500) < 10
+
+
 @pytest.mark.parametrize("explained", [True, False], ids=["all frames", "neighbours alone"])
 def test_rotations_stand_in_for_a_scene(solve, explained):
     with pytest.warns(RsUndistortWarning, match="only rotated: without parallax there are directions"):

@@ -46,6 +46,7 @@ def test_the_readout_time_is_reported_with_its_evidence():
     [
         ({}, ""),
         ({"stabilisation": {"verdict": "stabilised", "reason": "stabilised: why"}}, "stabilised: why"),
+        ({"stands": True, "sigma": 0.1}, "the camera hardly moves"),
         ({"source": "what was known before"}, "does not determine it better than it was known before"),
         ({"sigma": 0.007}, "the camera moved too little: 20.5 +- 7.0 ms"),
         (

@@ -14,15 +14,9 @@ from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, GuessedCameras, bundle_adjust
 from rsundistort.bundle.path_prior import FramePath
 from rsundistort.errors import ReconstructionError
-from rsundistort.solve import video_path
-from rsundistort.solve.video_path import (
-    _at_first,
-    _is_other_lens,
-    _new_points,
-    _travelled,
-    _with_known_lens,
-    _with_unknown_lens,
-)
+from rsundistort.solve import clip_lens, video_path
+from rsundistort.solve.clip_lens import at_first, is_other_lens, with_known_lens, with_unknown_lens
+from rsundistort.solve.video_path import _new_points, _travelled
 from rsundistort.verdict.judge_path import ReadoutTime
 
 FRAME_S = 1 / 30
@@ -37,13 +31,13 @@ def first_adjustment(zoom=None, off=1.2):
     mapped = bundle_adjust(wrong, "global", BundleOptions(outlier_rounds=0, deviations="model")).reconstruction
     guessed = GuessedCameras(tuple(mapped.cameras), {"f": 0.2})
     options = BundleOptions(path=FramePath(times, FRAME_S), refine=("f", "cx", "cy", "k1"), guessed=guessed)
-    return _with_unknown_lens(mapped, _at_first(options), StageLog(None)), camera
+    return with_unknown_lens(mapped, at_first(options), StageLog(None)), camera
 
 
 @pytest.mark.parametrize("off", [0.8, 1.25])
 def test_a_wrong_focal_length_is_no_lens_that_varies(off):
     result, camera = first_adjustment(off=off)
-    assert not _is_other_lens(result, camera, 0.03)
+    assert not is_other_lens(result, camera, 0.03)
     assert result.focal_sigma == 0.0
 
 
@@ -97,7 +91,7 @@ def clip_of(monkeypatch):
             return path(*last) if isinstance(last, tuple) else path(last, 0.1)
 
         monkeypatch.setattr(video_path, "_path_again", again)
-        monkeypatch.setattr(video_path, "readout_of", lambda result: result.readout)
+        monkeypatch.setattr(clip_lens, "readout_of", lambda result: result.readout)
         monkeypatch.setattr(video_path, "read_num_verified", lambda _: {})
         monkeypatch.setattr(video_path, "share_that_fits", lambda *_: 1.0)
         placed = of_lens(500.0), Matches(calibrated)
@@ -158,8 +152,8 @@ def test_a_lens_that_is_known_varies_only_if_that_explains_the_frames(
         sizes = (focal_sigma, varying_px) if options.varying else (0.0, steady_px)
         return SimpleNamespace(focal_sigma=sizes[0], sigma_px=sizes[1])
 
-    monkeypatch.setattr(video_path, "bundle_adjust", adjusted)
-    found = _with_known_lens(None, _at_first(BundleOptions()), StageLog(None))
+    monkeypatch.setattr(clip_lens, "bundle_adjust", adjusted)
+    found = with_known_lens(None, at_first(BundleOptions()), StageLog(None))
     assert (found.focal_sigma > 0) == varies
 
 

@@ -184,3 +184,5 @@ def test_frames_of_a_tripod_that_need_no_correction_have_no_shape():
     text = verdict_of(solution).sentences[2]
     assert "the camera only rotated, so that there is no scene" in text
     assert "as good as" not in text
+    stands = replace(solution, quality={"readout_time": {**time, "stands": True}})
+    assert "the camera hardly moved, so that there is no scene" in verdict_of(stands).sentences[2]

@@ -106,6 +106,15 @@ class PhotoCameras:
             decentring.append((by_rows, by_columns))
         return GuessedCameras(self.cameras, sigmas, decentring if default is GIVEN_SIGMA else ())
 
+    def likely_sigma(self, image: int) -> dict[str, float]:
+        """By how much guesses of cameras like that of a photo are off, whether or not it is known better.
+
+        The intrinsics are in the units of `GuessedCameras`.
+        """
+        k = int(self.camera_idx[image])
+        of_file = self.sigma[k].get("f", 0.0) if self.sigma else 0.0
+        return {**GUESS_SIGMA, "f": max(GUESS_SIGMA["f"], of_file)}
+
     def sigma_of_file(self, k: int) -> dict[str, float]:
         """Standard deviations of a camera for `camera.json`; {} of a calibration that has the default ones."""
         camera = self.cameras[k]

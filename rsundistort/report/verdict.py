@@ -113,6 +113,11 @@ def _only_rotated(solution: Solution) -> bool:
     return _is_video(solution) and len(centers) > 1 and not np.ptp(centers, axis=0).any()
 
 
+def _stands(solution: Solution) -> bool:
+    """Whether the camera of a video hardly moved at all."""
+    return bool((solution.quality.get("readout_time") or {}).get("stands"))
+
+
 def _is_video(solution: Solution) -> bool:
     return "readout_time" in solution.quality
 
@@ -160,7 +165,8 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
         reason = _unneeded(solution, largest) or "no shutter can be seen"
         shape = "the shape of the scene is as good as that of a global shutter"
         if _only_rotated(solution):
-            shape = "the camera only rotated, so that there is no scene"
+            moves = "hardly moved" if _stands(solution) else "only rotated"
+            shape = f"the camera {moves}, so that there is no scene"
         text = f"No correction is needed: {reason}, and {shape}."
         return "still", "No correction needed", text + _unseen(solution)
     level, sentence = _height(solution)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -11,17 +11,18 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from ..bundle.intrinsics import moved_camera
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.array_types import Array, Index
-from ..model.projection import unproject_points
+from ..model.projection import project_points, unproject_points
 from ..sfm.descriptor_matches import DescriptorIndex, match_descriptors
 from ..sfm.features import Features
 from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
 
-__all__ = ["as_directions", "rotating_only", "rotation_between", "seen_again"]
+__all__ = ["as_directions", "lens_shows_px", "rotating_only", "rotation_between", "seen_again"]
 
 _Corners = tuple[Array, Array]
 
@@ -42,6 +43,8 @@ _WIDE, _NEAR_PX, _LENS_TRIALS, _UNLIKELY_PX = (-0.1, -0.2, -1.0 / 3.0), 1.0, 80,
 # What is left by it must be so much less than by no perspective at all: what slides by is seen by any lens.
 _MUCH_LESS = 0.5
 _LENS_SIGMAS = np.array([0.5, 0.2, 0.2])
+# Places along each side of a frame, and frames, where a lens may show; and a rotation that is small, radians.
+_LOOKED_AT, _FRAMES, _SMALL = 7, 60, 1e-6
 # Key frames before a cut that one after it may show again, and its features that may.
 _LAST, _MATCHED = 4, 2048
 
@@ -232,6 +235,41 @@ def _joined(
         ),
     )  # fmt: skip
     return rec.with_points(np.ones(len(rec.observations), bool))
+
+
+def lens_shows_px(turned: Reconstruction, sigma: Mapping[str, float]) -> float:
+    """By how much frames that only rotate would look different through another lens, root mean square in pixels.
+
+    That of a standard deviation of the intrinsic (of `GuessedCameras`) that shows most. Rotations make up for most of
+    it, and for all of it where they are small: a lens shows by how it moves the edge of the frame and its middle.
+    """
+    camera = turned.cameras[0]
+    ends = np.array([camera.width - 1.0, camera.height - 1.0])
+    xy = np.stack(np.meshgrid(*np.linspace(0.0, ends, _LOOKED_AT).T), axis=2).reshape(-1, 2)
+    some = np.unique(np.linspace(0, turned.num_images - 1, _FRAMES).astype(int))
+    after = [turned.R_cw[k] @ turned.R_cw[0].T for k in some.tolist()]
+
+    def seen(R: Array, lens: Camera) -> Array:
+        there, valid = project_points(_directions(xy, lens) @ R.T, lens, RowMotion(), "global")
+        inside = valid & (there >= 0.0).all(axis=1) & (there <= ends).all(axis=1)
+        return np.where(inside[:, None], there, np.nan)
+
+    small = [Rotation.from_rotvec(_SMALL * axis).as_matrix() for axis in np.eye(3)]
+    rays = _directions(xy, camera)
+    by_rotation = np.stack(
+        [(project_points(rays @ R.T, camera, RowMotion(), "global")[0] - xy) / _SMALL for R in small], axis=2
+    ).reshape(-1, 3)
+    through, most = [seen(R, camera) for R in after], 0.0
+    for name, value in sigma.items():
+        lens, left = moved_camera(camera, [name], np.array([value])), [np.zeros(0)]
+        for R, before in zip(after, through, strict=True):
+            apart = (seen(R, lens) - before).ravel()
+            there = np.isfinite(apart) & np.isfinite(by_rotation).all(axis=1)
+            turn = np.linalg.lstsq(by_rotation[there], apart[there], rcond=None)[0]
+            left.append(apart[there] - by_rotation[there] @ turn)
+        each = np.concatenate(left)
+        most = max(most, float(np.sqrt(2.0 * (each**2).mean()))) if len(each) else np.inf
+    return most
 
 
 def as_directions(scene: Reconstruction, turned: Reconstruction) -> Reconstruction:

@@ -57,6 +57,8 @@ class FoundPath:
         less; else 0.
     share_that_fits : float
         Share of the matches of key frames that its poses fit.
+    stands : bool
+        Whether the camera moved so little that its frames would look the same through any lens.
     """
 
     clip: Clip
@@ -66,6 +68,7 @@ class FoundPath:
     felt: Felt | None = None
     travel_px: float = 0.0
     share_that_fits: float = 1.0
+    stands: bool = False
 
     @property
     def path(self) -> FramePath:
@@ -193,6 +196,7 @@ def _evidence(found: FoundPath, tested: _Tested, alone: ReadoutTime, at_once: bo
         "unbounded_seconds": float(on_path.unbounded_s[0]),
         "unfollowed_px": tested.vibration_px,
         "frames": len(on_path.names),
+        "stands": found.stands,
         "halves": [] if tested.halves is None else [each._asdict() for each in tested.halves],
         "by_speed": by_speed if len(by_speed) > 1 else [],
         "stabilisation": {"verdict": shaking.verdict, "reason": shaking.reason},

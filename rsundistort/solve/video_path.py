@@ -13,7 +13,6 @@ import numpy as np
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
-from ..bundle.held_out import MIN_FALL
 from ..bundle.own_motions import OwnMotions, own_motions
 from ..bundle.path_prior import FramePath, PathPrior, PathStart
 from ..errors import InputError, ReconstructionError, RsUndistortWarning
@@ -22,7 +21,7 @@ from ..input.load import LoadedPhotos
 from ..input.stabilisation import Stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
-from ..model import Camera, Reconstruction, opposite
+from ..model import Reconstruction, opposite
 from ..model.reprojection import reprojection_residuals
 from ..sfm import MatchedPhotos, retriangulate
 from ..sfm.contradiction import share_that_fits
@@ -30,8 +29,9 @@ from ..sfm.epipolar import read_num_verified
 from ..verdict.judge_path import SIGMAS
 from .clip_direction import likely_directions, read_along
 from .clip_gyroscope import felt_gyroscope, own_gyroscope, readout_of
+from .clip_lens import at_first, if_it_focuses, is_other_lens, unsettled, with_known_lens, with_unknown_lens
 from .clip_pair import FramePair
-from .clip_pan import as_directions, rotating_only
+from .clip_pan import as_directions, lens_shows_px, rotating_only
 from .clip_stabilisation import as_filmed, was_stabilised
 from .clip_tracks import Followed, focused_as, follow_points, followed_again, with_all_frames
 from .clip_verdict import FoundPath, judged
@@ -64,16 +64,8 @@ _SIGMA_ROUNDS, _SETTLED = 4, 0.05
 # Prior standard deviations of the path through two frames, which determine none: rotation (rad), and travel (ways from
 # one to the other). The rates of a first frame may change by ten times as much: the velocity by a fifth.
 _OF_TWO = 5e-3, 0.02
-# Relative fall of the cost that ends an adjustment of a path that another one follows.
-_ROUGH_COST = 1e-4
-# A focal length changes from frame to frame, by focusing or zooming, if a first adjustment finds it to vary by more
-# (relative standard deviation). That one does not know the path well yet: where the lens stays it finds up to 2.4e-4.
-_FOCUSES = 5e-4
-# A scene is mapped again by the focal length that its path found, and a path is found again, if focal lengths differ by
-# these shares; so many times.
-_MAPPED_BY, _SOLVED_BY, _LENS_ROUNDS = 0.05, 0.03, 3
-# So may it be if its readout time moved by this share of the time between frames.
-_SETTLED_BY = 0.01
+# A scene is mapped again if its path found a focal length that differs by this share; so many times.
+_MAPPED_BY, _LENS_ROUNDS = 0.05, 3
 # If new points are fewer than this share of those before, rays may meet at this angle: ten times what pixels measure.
 _LEAST_SHARE, _LEAST_DEG = 0.3, 0.2
 # Standard deviation of a readout time, as a share of the time between frames, that no false axis of it leaves.
@@ -138,7 +130,12 @@ def solve_clip(
     directions = (keys.cameras.of(0).readout,) if at_once else likely_directions(keys.cameras)
     keys, found = _as_read(directions, along, clip.frame_s)
     tell_of_gaps(clip, found.clip)
-    if found.path.rotation_only:
+    if found.stands:
+        warnings.warn(
+            "the camera hardly moves, which says nothing of shutter, lens and scene: film while you turn or carry it",
+            RsUndistortWarning, stacklevel=3,
+        )  # fmt: skip
+    elif found.path.rotation_only:
         why = "travelled too little" if found.travel_px else "only rotated"
         warnings.warn(
             f"the camera {why}: without parallax there are directions, but no positions and no scene",
@@ -182,6 +179,8 @@ def _filmed_by(
     if len(clip.names) == 2:
         two = rotated if explained == "by rotations" else None
         return two or _of_two(clip, keys, path, options_of, log)
+    if rotated is not None and rotated.stands:
+        return rotated
     direction = keys.cameras.of(0).readout
 
     def read_so() -> tuple[Reconstruction, MatchedPhotos]:
@@ -232,6 +231,8 @@ def _only_rotated(
 ) -> tuple[FoundPath | None, str]:  # fmt: skip
     """The path of a camera that only rotates, if that explains neighbours; and by what it explains all frames.
 
+    Where they would look the same through any lens, but for errors of the flow, they say nothing of it: it is held.
+
     "by rotations", of a lens that may focus if that leaves no more than the flow's own error; "by zooming" only: by a
     focal length that varies, which takes travel for zoom; "by a lens" only, whose distortion nobody knew; or "".
     """
@@ -239,12 +240,16 @@ def _only_rotated(
     start, found, explained = rotating_only(clip, keys), None, ""
     if start is not None:
         path = replace(path, rotation_only=True)
-        options = replace(options_of(start), path=path)
+        options, ways = replace(options_of(start), path=path), ["by rotations", "by zooming"]
+        stands = lens_shows_px(start, keys.cameras.likely_sigma(0)) < _EXACT_PX
+        if stands:  # errors of the flow alone would say the lens
+            start = as_directions(start, replace(start, cameras=[keys.cameras.of(0)]))
+            options, ways = replace(options, refine=()), ways[:1]
         # a focal length that the rotations said would absorb wild ones, which the path smooths yet
         said = start.cameras[0] != keys.cameras.of(0)
         rough = replace(options, refine=()) if said else options
-        for varying, how in ((False, "by rotations"), (True, "by zooming")):
-            other = _rotated_as_filmed(clip, path, start, options, replace(rough, varying=varying), log)
+        for how in ways:
+            other = _rotated_as_filmed(clip, path, start, options, replace(rough, varying=how == "by zooming"), log)
             if other is None:
                 continue
             dropped = 1 - len(other.result.reconstruction.observations) / len(start.observations)
@@ -254,6 +259,8 @@ def _only_rotated(
                 break
             if found is None or (explains and not explained):
                 found, explained = other, how if explains else ""
+        if stands and explained and found:
+            found = replace(found, stands=True)
     knew_lens = start is None or np.array_equal(start.cameras[0].dist, keys.cameras.of(0).dist)
     if explained == "by rotations" and not knew_lens and found and found.result.sigma_px >= _EXACT_PX:
         explained = "by a lens"
@@ -286,7 +293,7 @@ def _rotated_in_time(
     """
     as_said, rounds = (clip, path), 0
     while True:
-        how = replace(_at_first(replace(options, path=path)), varying=options.varying)
+        how = replace(at_first(replace(options, path=path)), varying=options.varying)
         result = bundle_adjust(start, "constant-motion", how, partial(tell, log, "rotations"))
         # it smooths wild rotations, which leaves an error several times as large as that of the next one
         if result.sigma_px >= _AT_FIRST * _FLOW_PX:
@@ -300,7 +307,7 @@ def _rotated_in_time(
 
 def _rotated_again(before: BundleResult, options: BundleOptions, log: StageLog) -> tuple[BundleResult, BundleOptions]:
     """The last adjustment of frames that only rotate, from one before, and its options."""
-    options = _if_it_focuses(options, before)
+    options = if_it_focuses(options, before)
     assert options.path is not None
     how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
     how = replace(how, path=replace(options.path, start=before.path_start()))
@@ -353,7 +360,7 @@ def _of_two(
     path = replace(path, start=PathStart(tuple(start.image_names), prior.start(start), _OF_TWO))
     # one step determines no spread of steps, and estimates of it would not settle
     options = replace(options_of(start), path=path, prior_sigma_rounds=0)
-    rough = replace(_at_first(options), prior_sigma_rounds=0, varying=False)
+    rough = replace(at_first(options), prior_sigma_rounds=0, varying=False)
     first = bundle_adjust(start, "constant-motion", rough, partial(tell, log, "path"))
     options = replace(options, path=replace(path, start=first.path_start()))
     whole = pair.of_all(first.reconstruction)
@@ -372,7 +379,7 @@ def _travelled(
     found = _first_path(clip, path, options_of, log, telemetry, mapped, matched)
     # in a scene that was mapped by a wrong lens frames bend as by a shutter
     for _ in range(_LENS_ROUNDS):
-        if matched.calibrated or not _is_other_lens(found.result, mapped.cameras[0], _MAPPED_BY):
+        if matched.calibrated or not is_other_lens(found.result, mapped.cameras[0], _MAPPED_BY):
             break
         log.begin("mapping again")
         try:
@@ -395,7 +402,7 @@ def _travelled(
             if not repeats:
                 raise
             break
-        moved = _unsettled(found.result, before.result, clip.frame_s, by_lens=not matched.calibrated)
+        moved = unsettled(found.result, before.result, clip.frame_s, by_lens=not matched.calibrated)
         if repeats and found.result.sigma_px > before.result.sigma_px and not moved < moved_before:
             found = before  # it ran away, as where frames that were knocked are among them
             break
@@ -450,22 +457,22 @@ def _first_path(
     own, said = own_motions(whole), (clip, path)
     clip, path = with_gaps(clip, path, whole, own)
     path, filmed = as_filmed(clip, whole, path, telemetry, own)
-    by_lens = _with_known_lens if matched.calibrated else _with_unknown_lens
+    by_lens = with_known_lens if matched.calibrated else with_unknown_lens
     held = path if was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
     options = replace(options_of(whole), path=held)
-    result = by_lens(whole, _at_first(options), log)
+    result = by_lens(whole, at_first(options), log)
     if was_stabilised(filmed) and result.sigma_px > _EXACT_PX:
         # so look lines that rotate by more than points show that a scene without a shutter bent, too
-        free = by_lens(whole, _at_first(replace(options, path=said[1])), log)
+        free = by_lens(whole, at_first(replace(options, path=said[1])), log)
         better, own = free.reconstruction, own_motions(free.reconstruction)
         timed, of_times = with_gaps(*said, better, own)
         of_times, other = as_filmed(timed, better, of_times, telemetry, own)
         if not was_stabilised(other) and _explains_it(free, result, clip.frame_s):
             clip, path, filmed, options = timed, of_times, other, replace(options, path=of_times)
-            result = free if of_times is said[1] else by_lens(better, _at_first(options), log)
+            result = free if of_times is said[1] else by_lens(better, at_first(options), log)
     elif held.held_sigma:
         # what a rough scene shows, and no path follows, a better one may not
-        free = by_lens(whole, _at_first(replace(options, path=path)), log)
+        free = by_lens(whole, at_first(replace(options, path=path)), log)
         own = own_motions(free.reconstruction)
         if not held_by_slow_rotations(clip, free.reconstruction, path, own).held_sigma:
             options, result = replace(options, path=path), free
@@ -493,7 +500,7 @@ def _path_again(
     whole = focused_as(on_path, with_all_frames(clip, scene, followed, on_path).without_photos(_LEAST_MEASUREMENTS))
     if held.held_sigma or not (was_stabilised(first.filmed) or clip.is_even):  # by what is better known now
         held = held_by_slow_rotations(clip, on_path, first.path, own_motions(on_path))
-    options = _if_it_focuses(replace(options_of(whole), path=replace(held, start=result.path_start())), result)
+    options = if_it_focuses(replace(options_of(whole), path=replace(held, start=result.path_start())), result)
     how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
     result = bundle_adjust(whole, "constant-motion", how, partial(tell, log, "path again"))
     _end_path(log, "path again", clip, whole, result)
@@ -510,76 +517,11 @@ def _new_points(matched: MatchedPhotos, keys: Reconstruction) -> Reconstruction:
     return scene
 
 
-def _with_unknown_lens(whole: Reconstruction, options: BundleOptions, log: StageLog) -> BundleResult:
-    """A path by a focal length of all frames; then by one that varies, if that explains them better.
-
-    One that varies at once makes up for a wrong one, frame by frame. The rest of the lens is mapping's as yet: it would
-    take the lines' rotations for itself.
-    """
-    options = replace(options, refine=("f",))
-    steady = bundle_adjust(whole, "constant-motion", replace(options, varying=False), partial(tell, log, "path"))
-    assert options.path is not None
-    # both at once run away: a scene that zooms in may as well come nearer
-    options = replace(options, refine=(), path=replace(options.path, start=steady.path_start()))
-    varying = bundle_adjust(steady.reconstruction, "constant-motion", options, partial(tell, log, "path"))
-    return varying if _explains_more(varying, steady) else steady
-
-
-def _with_known_lens(whole: Reconstruction, options: BundleOptions, log: StageLog) -> BundleResult:
-    """A path by a focal length that varies; by one of all frames, if that one varies and explains them no better.
-
-    A focal length that varies takes travel for zoom.
-    """
-    varying = bundle_adjust(whole, "constant-motion", options, partial(tell, log, "path"))
-    if varying.focal_sigma < _FOCUSES:
-        return varying
-    steady = bundle_adjust(whole, "constant-motion", replace(options, varying=False), partial(tell, log, "path"))
-    return varying if _explains_more(varying, steady) else steady
-
-
-def _explains_more(varying: BundleResult, steady: BundleResult) -> bool:
-    """Whether a lens that varies explains the frames better."""
-    return bool(varying.sigma_px**2 < (1 - MIN_FALL) * steady.sigma_px**2)
-
-
-def _is_other_lens(found: BundleResult, assumed: Camera, tolerance: float) -> bool:
-    """Whether a scene would be another one by the focal length that its path found."""
-    return bool(abs(np.log(found.reconstruction.cameras[0].K[0, 0] / assumed.K[0, 0])) > tolerance)
-
-
-def _unsettled(found: BundleResult, before: BundleResult, frame_s: float, *, by_lens: bool) -> float:
-    """How far a path moved, in what would have changed its points: focal lengths, and the readout time.
-
-    The readout time counts if it has moved beyond its deviations.
-    """
-    now, then = readout_of(found), readout_of(before)
-    apart = abs(now.seconds - then.seconds)
-    of_readout = apart / (_SETTLED_BY * frame_s) if apart > SIGMAS * now.sigma else 0.0
-    lens = before.reconstruction.cameras[0]
-    of_lens = abs(np.log(found.reconstruction.cameras[0].K[0, 0] / lens.K[0, 0])) / _SOLVED_BY if by_lens else 0.0
-    return float(max(of_lens, of_readout))
-
-
 def _end_path(log: StageLog, stage: str, clip: Clip, whole: Reconstruction, result: BundleResult) -> None:
     log.end(
         stage, frames=whole.num_images, of_frames=len(clip.names), rms_px=result.rms_px,
         iterations=result.num_iterations, readout_s=readout_of(result).seconds, stop_reason=result.stop_reason,
     )  # fmt: skip
-
-
-def _at_first(options: BundleOptions) -> BundleOptions:
-    """Options of an adjustment of a path that is followed by another one."""
-    return replace(
-        rough_options(options), outlier_rounds=2, prior_sigma_rounds=1, cost_tolerance=_ROUGH_COST, deviations="model",
-        varying=True,
-    )  # fmt: skip
-
-
-def _if_it_focuses(options: BundleOptions, first: BundleResult) -> BundleOptions:
-    """Options with a focal length that varies from frame to frame, if a first adjustment shows that."""
-    if first.focal_sigma < _FOCUSES:
-        return options
-    return replace(options, varying=True, focal_sigma_start=first.focal_sigma)
 
 
 def frame_path(clip: Clip, readout: tuple[float, str] | None) -> FramePath:

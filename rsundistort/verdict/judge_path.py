@@ -258,6 +258,8 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
     stabilised = evidence.get("stabilisation") or {}
     if stabilised.get("verdict") == "stabilised":
         return str(stabilised["reason"])
+    if evidence.get("stands"):
+        return "the camera hardly moves"
     if evidence["source"] == "what was known before":
         return "the video does not determine it better than it was known before"
     seconds, sigma = evidence["seconds"], evidence["sigma"]
