@@ -14,7 +14,8 @@ from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, GuessedCameras, bundle_adjust
 from rsundistort.bundle.path_prior import FramePath
 from rsundistort.errors import ReconstructionError
-from rsundistort.solve import clip_lens, video_path
+from rsundistort.input.photo_cameras import GUESS_SIGMA
+from rsundistort.solve import clip_lens, placing, video_path
 from rsundistort.solve.clip_lens import at_first, is_other_lens, with_known_lens, with_unknown_lens
 from rsundistort.solve.video_path import _new_points, _travelled
 from rsundistort.verdict.judge_path import ReadoutTime
@@ -101,6 +102,33 @@ def clip_of(monkeypatch):
         return by, found.result.reconstruction.cameras[0].K[0, 0]
 
     return clip_of
+
+
+GUESS = Camera(640, 360, [[447, 0, 319.5], [0, 447, 179.5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("f", "k1", "believed"),
+    [(520, -0.25, True), (800, 0.1, True), (2540, 9.0, False), (551, 1.05, False), (1300, 0.0, False)],
+)
+def test_a_lens_that_no_camera_has_is_not_what_key_frames_are_mapped_by(monkeypatch, f, k1, believed):
+    """Mapping takes what the shutter bends for the lens's."""
+    ways = []
+
+    def mapped(matched, *_, **__):
+        ways.append(matched.calibrated)
+        lens = replace(GUESS, K=[[f, 0, 319.5], [0, f, 179.5], [0, 0, 1]], dist=[k1, 0, 0, 0])
+        return SimpleNamespace(cameras=[GUESS if matched.calibrated else lens], num_images=8)
+
+    monkeypatch.setattr(placing, "map_photos", mapped)
+    monkeypatch.setattr(placing, "_num_fitting", lambda *_: 100)
+    monkeypatch.setattr(placing, "consistent", lambda *_: True)
+    matched, guessed = Matches(False, [GUESS]), GuessedCameras([GUESS], {**GUESS_SIGMA, "f": 0.28})
+    found = placing.map_key_frames(matched, guessed=guessed).cameras[0]
+    assert found.K[0, 0] == (f if believed else 447)
+    assert ways == [False, False] if believed else [False, True, True]
+    # one that is known, or was found by a path, is held anyway
+    assert placing.map_key_frames(replace(matched, calibrated=True)).cameras[0] == GUESS
 
 
 def test_a_lens_that_mapping_had_right_costs_nothing(clip_of):

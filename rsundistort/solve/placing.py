@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..batch.progress import StageLog
+from ..bundle import GuessedCameras
 from ..errors import ReconstructionError
 from ..input.load import LoadedPhotos, OtherFeatures
 from ..input.pairing import pairs_of_clip, pairs_to_match
@@ -77,11 +78,12 @@ def place_photos(
         matched = match(other.finer())
     assert matched is not None
     log.begin("mapping", len(photos.names))
+    guessed = None if photos.cameras.calibrated else photos.cameras.known_to(loose=True)
     key = f"mapped{_detail(photos)}" if photos.affine else "mapped"
     mapped: Reconstruction | None = kept.get(key)
     if mapped is None:
         try:
-            map_them = map_key_frames if of_clip else map_photos
+            map_them = partial(map_key_frames, guessed=guessed) if of_clip else map_photos
             mapped = map_them(matched, lambda done: log.tell("mapping", done, len(photos.names)))
         except ReconstructionError as error:
             overlapping = sum(count >= _MANY for count in read_num_verified(matched).values())
@@ -93,16 +95,31 @@ def place_photos(
     return mapped, matched
 
 
-def map_key_frames(matched: MatchedPhotos, progress: Callable[[int], None] | None = None) -> Reconstruction:
+def map_key_frames(
+    matched: MatchedPhotos, progress: Callable[[int], None] | None = None, guessed: GuessedCameras | None = None
+) -> Reconstruction:
     """Key frames of a video, mapped again by the matches that fit their poses until that moves none of them.
 
     Neighbours of a video have hardly any parallax, and what they show may be one plane: false matches, and inexact
     ones, which have room for a shutter, may turn the rest of a video at any key frame, and give it another scale. Each
     half fits itself, so that nothing shows it; but few of these matches fit the poses.
 
-    Parameters and errors are those of `sfm.map_photos`.
+    Mapping takes what the shutter bends for the lens's, knows nothing of what lenses are like, and lets them run away
+    where lines rotate fast, or hardly any parallax holds them (k1 = 9 where they rotate by two degrees, 58 before a
+    global shutter). A path finds the way back from a focal length that is off, but not from a scene that is bent like
+    that. So a lens that would be a surprise is held as it was guessed.
+
+    Other parameters and errors are those of `sfm.map_photos`.
+
+    Parameters
+    ----------
+    guessed : GuessedCameras, optional
+        What is known of the lens, if it is a guess.
     """
     mapped = map_photos(matched, progress, _OF_CLIP)
+    if guessed is not None and guessed.surprises(mapped.cameras):
+        matched = replace(matched, calibrated=True)
+        mapped = map_photos(matched, progress, _OF_CLIP)
     num_fitting = _num_fitting(matched, mapped)
     for _ in range(_MAPPING_ROUNDS):
         rough, before = mapped, num_fitting
