@@ -47,9 +47,13 @@ def solve(monkeypatch):
                 raise ReconstructionError("no scene point could be triangulated")
             return FoundPath(CLIP, scene, BundleOptions(path=PATH), filmed)
 
+        def hovered(*_):
+            raise ReconstructionError("nor can what rotations leave")
+
         found = turned and FoundPath(CLIP, turned, BundleOptions(path=replace(PATH, rotation_only=True)))
         monkeypatch.setattr(video_path, "_only_rotated", lambda *_: (found, "by rotations" if explained else ""))
         monkeypatch.setattr(video_path, "_travelled", travelled)
+        monkeypatch.setattr(video_path, "_hovered", hovered)
         return video_path.solve_clip(CLIP, keys_of(Camera(64, 36, np.eye(3))), PATH, None, None, StageLog(None))
 
     monkeypatch.setattr(video_path, "own_gyroscope", lambda _: None)
@@ -273,3 +277,53 @@ def test_a_scene_that_shows_travel_takes_the_place_of_rotations(solve, monkeypat
     else:
         with pytest.warns(RsUndistortWarning, match="travelled too little"):
             assert solve(turned, True, scene) == (turned, 0.3)
+
+
+@dataclass(frozen=True)
+class Drone:
+    """A drone that yaws above ground that it looks at slantwise, and hovers more or less in one place."""
+
+    hovers: float
+    seed: int = 6
+
+    def rotations(self, time):
+        t = np.asarray(time)
+        wobble = 0.004 * np.stack([np.sin(9 * t), 3 * np.sin(2.2 * t) + 60 * t, np.sin(12 * t)], axis=1)
+        return Rotation.from_rotvec(wobble).as_matrix()
+
+    def centers(self, time):
+        t = np.asarray(time)
+        return self.hovers * np.stack([np.sin(5 * t), np.cos(7 * t + 1), np.sin(8 * t)], axis=1)
+
+
+def slanted(hand):
+    """What it sees, its directions as of one place, and the times of its frames."""
+    seen, time_s = filmed(hand, num_points=300, noise_px=0.1)
+    standing = as_directions(seen, replace(seen, center_w=np.zeros_like(seen.center_w)))
+    path = FramePath(time_s, 1 / 30, rotation_only=True)
+    options = BundleOptions(path=path)
+    return FoundPath(CLIP, bundle_adjust(standing, "constant-motion", options), options)
+
+
+def test_parallax_that_looks_like_a_readout_is_a_scene(monkeypatch):
+    """Too little to map it, and enough to tell depths."""
+    rotated = slanted(Drone(0.01))
+    true_s = 0.6 / 30
+    found = video_path._hovered(rotated, StageLog(None))
+    time_s, sigma_s = (float(each[0]) for each in (found.result.path.readout_s, found.result.path.sigma_readout_s))
+    assert abs(time_s - true_s) < 3 * sigma_s < 0.1 * true_s
+    assert abs(rotated.result.path.unbounded_s[0] - true_s) > 5 * abs(time_s - true_s)
+    assert found.result.sigma_px < 0.12
+    assert not found.path.rotation_only
+    assert np.ptp(found.result.reconstruction.center_w, axis=0).max() > 1e-3
+
+    # it takes the place of rotations by as much as any scene has to
+    def nothing(*_):
+        raise ReconstructionError("no scene point could be triangulated")
+
+    monkeypatch.setattr(video_path, "_travelled", nothing)
+    keys = keys_of(Camera(64, 36, np.eye(3)))
+    for hand, is_scene in ((rotated, True), (slanted(Drone(0.0)), False)):
+        monkeypatch.setattr(video_path, "_only_rotated", lambda *_, found=hand: (found, "by rotations"))
+        chosen = video_path._filmed_by(CLIP, keys, PATH, None, StageLog(None), None, lambda: (None, None))
+        assert chosen.path.rotation_only is not is_scene

@@ -56,6 +56,8 @@ _AT_FIRST = 4.0
 # A scene is one if rotations leave of its measurements so many times what it leaves, by this quantile, and if it has
 # such a share of the frames that rotations explain.
 _PARALLAX, _MOST, _LEAST_SHARED = 1.5, 0.75, 0.8
+# Way that a camera which hardly travels is off at first, in distances of its scene: half a pixel.
+_HARDLY = 1e-3
 # Times that frames which only rotate are adjusted again, since some are missing between them.
 _GAP_ROUNDS = 3
 # Solves that estimate the prior standard deviations of a path, and the share by which these may still change: with
@@ -190,10 +192,15 @@ def _filmed_by(
     try:
         found = _travelled(clip, path, options_of, log, telemetry, read_so)
     except (InputError, ReconstructionError):
-        # no scene: rotations that explain neighbours are all that there is
+        # no scene: rotations that explain neighbours are all that there is, unless what they leave is one
         if rotated is None:
             raise
-        return rotated
+        if explained != "by rotations":
+            return rotated
+        try:
+            found = _hovered(rotated, log)
+        except ReconstructionError:
+            return rotated
     if rotated is None:
         return found
     if explained == "by rotations":
@@ -313,6 +320,27 @@ def _rotated_again(before: BundleResult, options: BundleOptions, log: StageLog) 
     how = replace(how, path=replace(options.path, start=before.path_start()))
     told = partial(tell, log, "rotations")
     return bundle_adjust(before.reconstruction, "constant-motion", how, told), options
+
+
+def _hovered(rotated: FoundPath, log: StageLog) -> FoundPath:
+    """The path of a camera that travels too little for its scene to be mapped, from rotations that explain its frames.
+
+    Some tenths of a pixel of parallax, more of it below than above before slanted ground, look like lines that rotate:
+    readout times come out anywhere. All frames share the depths, so that an adjustment finds these and the way, from
+    one distance of all and next to no way.
+    """
+    log.begin("travel")
+    turned, told = rotated.result.reconstruction, partial(tell, log, "travel")
+    way = _HARDLY * np.random.default_rng(0).normal(size=turned.center_w.shape)  # without any, depths would be free
+    path = replace(rotated.path, rotation_only=False)
+    options = replace(rotated.options, path=path)
+    rough = replace(at_first(replace(options, refine=())), varying=False)
+    first = bundle_adjust(replace(turned, center_w=way), "constant-motion", rough, told)
+    how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
+    how = replace(how, path=replace(path, start=first.path_start()))
+    result = bundle_adjust(first.reconstruction, "constant-motion", how, told)
+    log.end("travel", points=result.reconstruction.num_points, readout_s=readout_of(result).seconds)
+    return FoundPath(rotated.clip, result, options)
 
 
 def _left_by_rotations(found: FoundPath, rotated: FoundPath, log: StageLog) -> float:
