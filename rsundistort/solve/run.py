@@ -188,7 +188,8 @@ def _solved(
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
     rec, sigmas = solved.result.reconstruction, solved.result.sigma_intrinsics
-    warn_of_weak_focal_lengths(loaded.cameras, rec.cameras, sigmas, {*rec.camera_idx.tolist()})
+    if not solved.evidence.get("stands"):  # of a camera that hardly moves that was said already
+        warn_of_weak_focal_lengths(loaded.cameras, rec.cameras, sigmas, {*rec.camera_idx.tolist()})
     facts: dict[str, Any] = {} if is_clip else {"features": options.features}
     facts |= {
         "max_features": options.most_features(is_clip),
