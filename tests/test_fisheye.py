@@ -165,16 +165,18 @@ def test_pixels_by_which_a_fisheye_is_apart_are_those_of_a_lens_that_is_fitted()
 
 
 @pytest.mark.parametrize(
-    ("f", "is_doubtful", "bends_px", "becomes_one"),
+    ("f", "signs", "bends_px", "becomes_one"),
     [
-        (460, True, 0.0, True),  # nothing explains a view this wide
-        (460, False, 0.1, True),  # it needs a residual field
-        (460, False, 0.0, False),  # a pinhole lens explains it
-        (900, True, 0.1, False),  # a fisheye of so narrow a view is a pinhole lens
-        (900, False, 3.0, True),  # no pinhole lens deviates by so much
+        (460, (True, False), 0.0, True),  # nothing explains a view this wide
+        (460, (False, True), 0.0, True),  # it needs a lens that varies
+        (460, (False, False), 0.1, True),  # it needs a residual field
+        (460, (False, False), 0.0, False),  # a pinhole lens explains it
+        (900, (True, True), 0.1, False),  # a fisheye of so narrow a view is a pinhole lens
+        (900, (False, False), 3.0, True),  # no pinhole lens deviates by so much
     ],
 )
-def test_cameras_of_which_nothing_is_known_become_fisheyes(f, is_doubtful, bends_px, becomes_one):
+def test_cameras_that_no_file_describes_become_fisheyes(f, signs, bends_px, becomes_one):
+    signs = dict(zip(("is_unexplained", "varies"), signs, strict=True))
     K = np.array([[f, 0, 511.5], [0, f, 383.5], [0, 0, 1]])
     found = Camera(1024, 768, K + np.array([[1, 0, 2], [0, 1, -3], [0, 0, 0]]), [-0.25, 0.07, 0, 0, -0.01])
     if bends_px:
@@ -182,13 +184,23 @@ def test_cameras_of_which_nothing_is_known_become_fisheyes(f, is_doubtful, bends
         found = replace(found, field=field)
     guess = Camera(1024, 768, K, readout="bottom-to-top")
     cameras = PhotoCameras((guess,), ("hero",), np.zeros(9, int), False, (False,), "EXIF")
-    other = cameras_as_fisheyes(cameras, [found], is_doubtful)
+    other = cameras_as_fisheyes(cameras, [found], **signs)
     assert (other is not None) == becomes_one
     if other is not None:
         assert other[0].cameras == (Camera(1024, 768, found.K, readout="bottom-to-top", lens="fisheye"),)
         assert other[1] == ["no pinhole lens explains the photos of hero, and a fisheye does: solved as of one"]
-        assert cameras_as_fisheyes(other[0], other[0].cameras, True) is None  # it is one already
-    assert cameras_as_fisheyes(replace(cameras, calibrated=True), [found], is_doubtful) is None
+        assert cameras_as_fisheyes(other[0], other[0].cameras, **signs) is None  # it is one already
+    assert cameras_as_fisheyes(replace(cameras, calibrated=True), [found], **signs) is None
+
+
+def test_a_focal_length_that_is_not_known_is_no_longer_than_that_of_a_full_frame_fisheye():
+    guess = Camera(1024, 768, [[760.0, 0, 511.5], [0, 760.0, 383.5], [0, 0, 1]])
+    cameras = PhotoCameras((guess,), ("a",), np.zeros(9, int), False, (False,), "the photos")
+    assert cameras_as_fisheyes(cameras, [guess], is_unexplained=True, varies=False) is None
+    unknown = replace(cameras, without_focal=(0,))
+    assert cameras_as_fisheyes(unknown, [guess], is_unexplained=False, varies=True) is None
+    (found,) = cameras_as_fisheyes(unknown, [guess], is_unexplained=True, varies=False)[0].cameras
+    assert found.K[0, 0] == found.K[1, 1] == pytest.approx(1280 / np.pi)
 
 
 @pytest.mark.slow

@@ -246,8 +246,8 @@ def _by_cameras(
 def _as_fisheyes(loaded: LoadedPhotos, solved: Solved) -> tuple[PhotoCameras, list[str]] | None:
     """Cameras of another lens, as `cameras_as_fisheyes`."""
     varies = solved.choice is not None and solved.choice.varying
-    is_doubtful = varies or bool(unexplained_reasons(solved.result, solved.choice))
-    return cameras_as_fisheyes(loaded.cameras, solved.shared.cameras, is_doubtful)
+    unexplained = bool(unexplained_reasons(solved.result, solved.choice))
+    return cameras_as_fisheyes(loaded.cameras, solved.shared.cameras, is_unexplained=unexplained, varies=varies)
 
 
 def _by_zoom(loaded: LoadedPhotos, solved: Solved) -> tuple[PhotoCameras, list[str]] | None:
