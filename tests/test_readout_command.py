@@ -54,6 +54,7 @@ def test_the_readout_time_is_reported_with_its_evidence():
             "contradict each other, 14 standard deviations apart",
         ),
         ({"unfollowed_px": 2.0}, "the frames rotate by 2.0 px more than their path explains"),
+        ({"share_that_fits": 0.5}, "the poses fit only 50 % of what key frames share: something large moves"),
         ({"seconds": 0.04, "of_frame": 1.2}, "longer than the time from frame to frame"),
         ({"unbounded_seconds": 0.0345, "sigma": 0.001}, ""),
         ({"unbounded_seconds": 0.0345, "sigma": 0.004}, "it would be 34 +- 4 ms, longer than the time from frame to"),

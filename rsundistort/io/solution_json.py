@@ -67,6 +67,7 @@ _READOUT_TIME = {
     "of_frame?": float,
     "unbounded_seconds?": float,
     "unfollowed_px?": float,
+    "share_that_fits?": float,
     "stands?": bool,
     "halves?": Maybe([_TIME]),
     "by_speed?": Maybe([_TIME]),

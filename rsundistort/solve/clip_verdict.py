@@ -195,6 +195,7 @@ def _evidence(found: FoundPath, tested: _Tested, alone: ReadoutTime, at_once: bo
         "of_frame": time.seconds / found.clip.frame_s,
         "unbounded_seconds": float(on_path.unbounded_s[0]),
         "unfollowed_px": tested.vibration_px,
+        "share_that_fits": found.share_that_fits,
         "frames": len(on_path.names),
         "stands": found.stands,
         "halves": [] if tested.halves is None else [each._asdict() for each in tested.halves],

@@ -146,10 +146,7 @@ def _of_poses(rec: Reconstruction, rotation_ratio: float, share_that_fits: float
             f"{rotation_ratio * rec.cameras[0].K[0, 0]:.0f} px, not {rec.cameras[0].K[0, 0]:.0f} px."
         )
     if share_that_fits < _LEAST_SHARE:
-        reasons.append(
-            f"The poses fit only {100 * share_that_fits:.0f} % of what key frames share: something large moves, "
-            "parts of the scene look alike, or all of it lies in one plane."
-        )
+        reasons.append(f"The {_fit_little(share_that_fits)}.")
     if travel_px > 0:
         reasons.append(
             f"The camera travelled, too: rotations leave {travel_px:.1f} px of what frames far apart share. The focal "
@@ -253,6 +250,13 @@ def in_ms(seconds: float, sigma: float) -> str:
     return f"{1e3 * seconds:.1f} {said}"
 
 
+def _fit_little(share_that_fits: float) -> str:
+    return (
+        f"poses fit only {100 * share_that_fits:.0f} % of what key frames share: something large moves, parts of the "
+        "scene look alike, or all of it lies in one plane"
+    )
+
+
 def problem_of(evidence: Mapping[str, Any]) -> str:
     """Why a video does not determine its readout time, by `quality.readout_time`; empty if it does."""
     stabilised = evidence.get("stabilisation") or {}
@@ -283,6 +287,8 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
         if _is_outside(ReadoutTime(seconds, sigma), (ReadoutTime(**first), ReadoutTime(**second))):
             return "the halves of the video contradict the whole"
+    if (share := evidence.get("share_that_fits", 1.0)) < _LEAST_SHARE:
+        return f"the {_fit_little(share)}"
     if evidence.get("by_speed"):
         slow, fast = (ReadoutTime(each["seconds"], each["sigma"]) for each in evidence["by_speed"])
         if evidence["source"] != BY_SLOW_ROTATIONS and _runs_the_other_way(slow, fast):
