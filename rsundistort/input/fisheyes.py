@@ -67,7 +67,9 @@ def cameras_as_fisheyes(
             changed[k] = replace(camera, K=wide.K, dist=np.zeros(0), lens="fisheye")
             labels.append(cameras.labels[k])
     notes = [
-        f"no pinhole lens explains the photos of {label}, and a fisheye does: solved as of one" for label in labels
+        f"no pinhole lens explains the photos of {label}, and a fisheye does: solved as of one; rectified photos show "
+        "the middle of it (--alpha: more)"
+        for label in labels
     ]
     return (replace(cameras, cameras=tuple(changed)), notes) if notes else None
 
