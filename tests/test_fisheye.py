@@ -25,8 +25,9 @@ from rsundistort import (
 )
 from rsundistort.colmap.lenses import camera_to_colmap, refined_camera
 from rsundistort.errors import InputError
-from rsundistort.input.fisheyes import cameras_as_fisheyes, fisheye_apart_px
+from rsundistort.input.fisheyes import cameras_as_fisheyes
 from rsundistort.input.photo_cameras import PhotoCameras
+from rsundistort.model.field import fisheye_apart_px
 from rsundistort.model.projection import project_points
 from rsundistort.sfm import Features
 from rsundistort.sfm.database import ideal_keypoints
@@ -171,8 +172,7 @@ def test_pixels_by_which_a_fisheye_is_apart_are_those_of_a_lens_that_is_fitted()
         (460, (False, True), 0.0, True),  # it needs a lens that varies
         (460, (False, False), 0.1, True),  # it needs a residual field
         (460, (False, False), 0.0, False),  # a pinhole lens explains it
-        (900, (True, True), 0.1, False),  # a fisheye of so narrow a view is a pinhole lens
-        (900, (False, False), 3.0, True),  # no pinhole lens deviates by so much
+        (900, (True, True), 3.0, False),  # a fisheye of so narrow a view is a pinhole lens
     ],
 )
 def test_cameras_that_no_file_describes_become_fisheyes(f, signs, bends_px, becomes_one):

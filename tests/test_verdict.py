@@ -186,7 +186,10 @@ def test_what_a_lens_of_another_model_bends_is_no_shutter(rng, monkeypatch):
     monkeypatch.setitem(judge.__globals__, "excess_px", lambda _: 0.6)
     verdict = judge(result, None, choice_of("rotation", gain=9.0))
     assert verdict.shutter == "not-determined"
-    assert 'of a fisheye, say "lens": "fisheye" in camera.json' in verdict.reasons[0]
+    advice = 'of a fisheye, say "lens": "fisheye" in camera.json'
+    assert advice not in verdict.reasons[0]  # a fisheye of so narrow a view is a pinhole lens
+    monkeypatch.setitem(judge.__globals__, "fisheye_apart_px", lambda _: 0.6)
+    assert advice in judge(result, None, choice_of("rotation", gain=9.0)).reasons[0]
     # a gyroscope may say so, too
     known = KnownMotions(gain=5.0, is_better=True, free_gain=0.0, miss=1.0, size=20.0)
     assert judge(result, None, replace(choice_of("rotation", gain=9.0), known_motions=known)).shutter == "found"

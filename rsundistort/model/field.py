@@ -26,6 +26,7 @@ __all__ = [
     "field_basis",
     "field_over_frame",
     "field_slope",
+    "fisheye_apart_px",
     "folds",
     "lens_pixels",
     "raw_pixels",
@@ -40,6 +41,8 @@ _LOOKED_AT = 33
 _STEEPEST = 0.5
 #: Largest field beside a lens model, root mean square over the frame: with more, it is not the model of this lens.
 MOST_FIELD_PX = 0.5
+# A pinhole lens ends before 90 degrees.
+_PINHOLE_ENDS = np.radians(85.0)
 
 
 def _splines(u: Array, count: int, slope: bool = False) -> Array:
@@ -128,6 +131,20 @@ def excess_px(camera: Camera) -> float:
     """Root mean square of a camera's field over its frame, if no lens of its kind deviates by so much; else 0."""
     size_px = float(np.sqrt((field_over_frame(camera)[1] ** 2).sum(2).mean()))
     return size_px if size_px > MOST_FIELD_PX else 0.0
+
+
+def fisheye_apart_px(camera: Camera) -> float:
+    """By how many pixels an equidistant fisheye of this focal length differs from the nearest pinhole lens.
+
+    Root mean square over what lies ahead of the camera, after k1, k2, k3 and another focal length.
+    """
+    x, y = ((np.arange(_LOOKED_AT) + 0.5) / _LOOKED_AT * side - 0.5 for side in (camera.width, camera.height))
+    radius = np.hypot(*np.meshgrid(x - camera.K[0, 2], y - camera.K[1, 2])).ravel() / camera.K[0, 0]
+    radius = radius[radius < _PINHOLE_ENDS]
+    tan = np.tan(radius)[:, None] ** [1, 3, 5, 7]
+    tan /= np.linalg.norm(tan, axis=0)
+    apart = tan @ np.linalg.lstsq(tan, radius)[0] - radius
+    return float(camera.K[0, 0] * np.sqrt((apart**2).mean()))
 
 
 def field_over_frame(camera: Camera, across: int = 33, down: int = 25) -> tuple[Array, Array]:

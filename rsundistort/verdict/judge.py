@@ -17,7 +17,7 @@ from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
-from ..model.field import excess_px
+from ..model.field import MOST_FIELD_PX, excess_px, fisheye_apart_px
 from ..model.focal_lengths import zooms
 from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, hidden_px, photo_motions
@@ -245,10 +245,14 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
             "motion during the readout, does not fit."
         )
     if (size := max(map(excess_px, result.reconstruction.cameras))) > 0:
-        pinhole = any(each.lens == "pinhole" and excess_px(each) > 0 for each in result.reconstruction.cameras)
+        # a fisheye of a narrower view is a pinhole lens
+        may_be = any(
+            each.lens == "pinhole" and excess_px(each) > 0 and fisheye_apart_px(each) > MOST_FIELD_PX
+            for each in result.reconstruction.cameras
+        )
         reasons.append(
             f"The photos deviate from the lens model by {size:.1f} px in the mean, more than any lens of its kind: it "
-            f"is not the model of this lens{_IF_FISHEYE if pinhole else ''}."
+            f"is not the model of this lens{_IF_FISHEYE if may_be else ''}."
         )
     if choice is not None:
         if choice.restless:
