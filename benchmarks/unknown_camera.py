@@ -8,8 +8,8 @@
 before anything is mapped, with its relative standard deviation, and `f` what the run ends with. `walk` of the sample
 scenes is a video without its camera file: `readout_ms` should be 20. With `--clips` only `f_pairs` of random clips
 (`clips.py`) is shown, and at the end the root mean square of its relative errors, and the largest. With `--lenses` the
-sample scenes are rendered again by wide lenses, a fisheye and a pinhole, with their shutter and without, and solved
-without a camera.
+sample scenes are rendered again by other lenses (a fisheye, a wide one, stretched ones), with their shutter and
+without, and solved without a camera.
 """
 
 from __future__ import annotations
@@ -36,9 +36,14 @@ from rsundistort.simulate import SceneOptions, simulate_scene
 from rsundistort.solve import OutputOptions
 
 ROOT = Path(__file__).resolve().parent.parent
-# The focal length is that of an action camera, 90 degrees from border to border of the pinhole's photo; a share of it.
-_WIDE = {"fisheye": [0.02, -0.005, 0.001, -0.0005], "pinhole": [-0.02, 0.01, 0.0, 0.0, 0.0]}
-_WIDE_F = {"fisheye": 0.45, "pinhole": 0.5}
+# Lenses by name: kind, fx and fy as shares of the width, coefficients. The fisheye is an action camera's, the wide
+# pinhole shows 90 degrees from border to border; pixels are 3 % too narrow, or squeezed by an anamorphic adapter.
+_LENSES = {
+    "fisheye": ("fisheye", 0.45, 0.45, [0.02, -0.005, 0.001, -0.0005]),
+    "wide": ("pinhole", 0.5, 0.5, [-0.02, 0.01, 0.0, 0.0, 0.0]),
+    "narrow pixels": ("pinhole", 0.833 / 0.97, 0.833, []),
+    "anamorphic": ("pinhole", 0.833 / 1.33, 0.833, []),
+}
 
 
 def solved(photos: Path, out: Path, camera: str | None = None) -> Solution:
@@ -95,11 +100,11 @@ def of_clips(folder: Path, kinds: list[str], seeds: list[int]) -> None:
 
 def of_lenses(work: Path, scenes: list[str]) -> None:
     """Scenes as wide lenses show them."""
-    for scene, (lens, dist), share in product(scenes, _WIDE.items(), (1.0, 0.0)):
+    for scene, (name, (lens, x, y, dist)), share in product(scenes, _LENSES.items(), (1.0, 0.0)):
         recipe = json.loads((ROOT / "sample_scenes" / scene / "recipe.json").read_text())
-        camera, folder = recipe["camera"], work / f"{scene}-{lens}-{share:.0f}"
-        f = _WIDE_F[lens] * camera["width"]
-        camera |= {"K": [[f, 0, camera["K"][0][2]], [0, f, camera["K"][1][2]], [0, 0, 1]], "dist": dist, "lens": lens}
+        camera, folder = recipe["camera"], work / f"{scene}-{name}-{share:.0f}"
+        fx, fy = x * camera["width"], y * camera["width"]
+        camera |= {"K": [[fx, 0, camera["K"][0][2]], [0, fy, camera["K"][1][2]], [0, 0, 1]], "dist": dist, "lens": lens}
         motion = recipe["motion"].items()
         recipe["motion"] = {key: share * value if key.endswith("_per_frame") else value for key, value in motion}
         folder.mkdir()
@@ -109,9 +114,9 @@ def of_lenses(work: Path, scenes: list[str]) -> None:
         solution = solved(folder / "scene" / "photos", folder / "out")
         result = evaluate(folder / "out", folder / "scene" / "ground_truth.json")
         found = {
-            "name": f"{scene}, {lens}, {'as it is' if share else 'no shutter'}",
+            "name": f"{scene}, {name}, {'as it is' if share else 'no shutter'}",
             "lens": solution.cameras[solution.registered[0].camera_id].lens,
-            "f_ratio": round(focal(solution) / f, 5),
+            "f_ratio": round(focal(solution) / fx, 5),
             "registered": result.registered,
             "rotation_deg": round(result.rotation_deg.median, 4),
             "psnr_db": round(result.psnr_db.median, 2),

@@ -53,6 +53,8 @@ from .run_outputs import (
     photo_times,
     remove_former,
 )
+from .solutions import explains_most, explains_variation
+from .stretched import cameras_if_stretched
 from .survey import clocks_of, survey_of
 from .tracks import of_registered
 from .video_path import frame_path, solve_clip
@@ -222,9 +224,9 @@ def _by_cameras(
     told = list[str]()
     with _saying() as said:
         solved, solving = solve(loaded, kept=kept)
-        for other_cameras, is_better in ((_as_fisheyes, _explains_most), (_by_zoom, _is_better)):
+        for other_cameras, is_better in _OTHER_CAMERAS:
             for _ in range(_CAMERA_ROUNDS):
-                apart = other_cameras(loaded, solved)
+                apart = other_cameras(loaded, solved, solving)
                 if apart is None:
                     break
                 cameras, notes = apart
@@ -243,14 +245,25 @@ def _by_cameras(
     return solved, solving, loaded
 
 
-def _as_fisheyes(loaded: LoadedPhotos, solved: Solved) -> tuple[PhotoCameras, list[str]] | None:
+def _as_fisheyes(loaded: LoadedPhotos, solved: Solved, _options: SolveOptions) -> tuple[PhotoCameras, list[str]] | None:
     """Cameras of another lens, as `cameras_as_fisheyes`."""
     varies = solved.choice is not None and solved.choice.varying
-    unexplained = bool(unexplained_reasons(solved.result, solved.choice))
-    return cameras_as_fisheyes(loaded.cameras, solved.shared.cameras, is_unexplained=unexplained, varies=varies)
+    return cameras_as_fisheyes(
+        loaded.cameras, solved.shared.cameras, is_unexplained=_is_unexplained(solved), varies=varies
+    )
 
 
-def _by_zoom(loaded: LoadedPhotos, solved: Solved) -> tuple[PhotoCameras, list[str]] | None:
+def _if_stretched(loaded: LoadedPhotos, solved: Solved, options: SolveOptions) -> tuple[PhotoCameras, list[str]] | None:
+    """Cameras of pixels that are not square, as `cameras_if_stretched`."""
+    return cameras_if_stretched(loaded.cameras, solved, options, is_unexplained=_is_unexplained(solved))
+
+
+def _is_unexplained(solved: Solved) -> bool:
+    undetermined = solved.verdict is not None and solved.verdict.shutter == "not-determined"
+    return undetermined or bool(unexplained_reasons(solved.result, solved.choice))
+
+
+def _by_zoom(loaded: LoadedPhotos, solved: Solved, _options: SolveOptions) -> tuple[PhotoCameras, list[str]] | None:
     """Cameras of another zoom, as `cameras_by_zoom`."""
     return cameras_by_zoom(loaded.cameras, loaded.names, _zooms(solved))
 
@@ -286,9 +299,15 @@ def _is_better(other: Solved, before: Solved) -> bool:
     return not fewer and other.result.sigma_px < before.result.sigma_px
 
 
-def _explains_most(other: Solved, before: Solved) -> bool:
-    """Whether a solution explains most of what another leaves of as many photos."""
-    return _is_better(other, before) and 2 * other.result.sigma_px**2 < before.result.sigma_px**2
+def _is_explained(other: Solved, before: Solved) -> bool:
+    """Whether a solution explains most of what another leaves of as many photos, or as much without varying."""
+    fewer = len(other.shared.image_names) < len(before.shared.image_names)
+    results = other.result, before.result
+    return not fewer and (explains_most(*results) or explains_variation(*results))
+
+
+# What else cameras may be, and when that is kept.
+_OTHER_CAMERAS = (_as_fisheyes, _is_explained), (_if_stretched, _is_explained), (_by_zoom, _is_better)
 
 
 def _solve(

@@ -7,12 +7,23 @@ from collections.abc import Collection
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..bundle import BundleResult
+from ..bundle.held_out import MIN_FALL
 from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
 from ..model.similarity import similarity_of
 from ..sfm import LEAST_TIES, SIFT_PX, connected_photos
 
-__all__ = ["agree", "consistent", "num_explained", "num_of_one_scale", "photos_apart", "same_places"]
+__all__ = [
+    "agree",
+    "consistent",
+    "explains_most",
+    "explains_variation",
+    "num_explained",
+    "num_of_one_scale",
+    "photos_apart",
+    "same_places",
+]
 
 # Of the noise of features: farther from its prediction no measurement is explained.
 _MOST_SIGMAS = 3.0
@@ -74,3 +85,14 @@ def same_places(rec: Reconstruction, other: Reconstruction) -> bool:
         if name in index_of and not np.linalg.norm(other.center_w[index_of[name]] - center) <= _AGREE_RAD * depth:
             return False
     return True
+
+
+def explains_most(other: BundleResult, before: BundleResult) -> bool:
+    """Whether one result explains most of what another leaves."""
+    return bool(2 * other.sigma_px**2 < before.sigma_px**2)
+
+
+def explains_variation(other: BundleResult, before: BundleResult) -> bool:
+    """Whether one result leaves no more than another, but for what noise may, which needs a lens that varies for it."""
+    no_more = bool(other.sigma_px**2 <= (1 + MIN_FALL) * before.sigma_px**2)
+    return no_more and before.reconstruction.varies and not other.reconstruction.varies
