@@ -176,7 +176,7 @@ def test_pixels_by_which_a_fisheye_is_apart_are_those_of_a_lens_that_is_fitted()
     ],
 )
 def test_cameras_that_no_file_describes_become_fisheyes(f, signs, bends_px, becomes_one):
-    signs = dict(zip(("is_unexplained", "varies"), signs, strict=True))
+    signs = dict(zip(("is_unexplained", "doubted"), signs, strict=True))
     K = np.array([[f, 0, 511.5], [0, f, 383.5], [0, 0, 1]])
     found = Camera(1024, 768, K + np.array([[1, 0, 2], [0, 1, -3], [0, 0, 0]]), [-0.25, 0.07, 0, 0, -0.01])
     if bends_px:
@@ -198,10 +198,10 @@ def test_cameras_that_no_file_describes_become_fisheyes(f, signs, bends_px, beco
 def test_a_focal_length_that_is_not_known_is_no_longer_than_that_of_a_full_frame_fisheye():
     guess = Camera(1024, 768, [[760.0, 0, 511.5], [0, 760.0, 383.5], [0, 0, 1]])
     cameras = PhotoCameras((guess,), ("a",), np.zeros(9, int), False, (False,), "the photos")
-    assert cameras_as_fisheyes(cameras, [guess], is_unexplained=True, varies=False) is None
+    assert cameras_as_fisheyes(cameras, [guess], is_unexplained=True, doubted=False) is None
     unknown = replace(cameras, without_focal=(0,))
-    assert cameras_as_fisheyes(unknown, [guess], is_unexplained=False, varies=True) is None
-    (found,) = cameras_as_fisheyes(unknown, [guess], is_unexplained=True, varies=False)[0].cameras
+    assert cameras_as_fisheyes(unknown, [guess], is_unexplained=False, doubted=True) is None
+    (found,) = cameras_as_fisheyes(unknown, [guess], is_unexplained=True, doubted=False)[0].cameras
     assert found.K[0, 0] == found.K[1, 1] == pytest.approx(1280 / np.pi)
 
 

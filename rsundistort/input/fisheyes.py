@@ -18,7 +18,7 @@ _FULL_FRAME = 1.0 / np.pi
 
 
 def cameras_as_fisheyes(
-    cameras: PhotoCameras, found: Sequence[Camera], *, is_unexplained: bool, varies: bool
+    cameras: PhotoCameras, found: Sequence[Camera], *, is_unexplained: bool, doubted: bool
 ) -> tuple[PhotoCameras, list[str]] | None:
     """The cameras of photos after those that no pinhole lens describes became fisheyes.
 
@@ -26,9 +26,10 @@ def cameras_as_fisheyes(
     ----------
     found : sequence of Camera
         Estimates of the same cameras.
-    is_unexplained, varies : bool
-        Whether the estimates leave more of the photos than noise, or need a lens that varies. Then, or where a lens
-        needs a residual field, cameras whose view is so wide that this makes a difference become fisheyes.
+    is_unexplained, doubted : bool
+        Whether the estimates leave more of the photos than noise; whether a pinhole lens is in doubt all the same, as
+        one that varies is. Then, or where a lens needs a residual field, cameras whose view is so wide that this makes
+        a difference become fisheyes.
 
     Returns
     -------
@@ -44,7 +45,7 @@ def cameras_as_fisheyes(
     changed, labels = [*cameras.cameras], list[str]()
     for k, (camera, estimate) in enumerate(zip(cameras.cameras, found, strict=True)):
         wide = _at_most(estimate, _FULL_FRAME) if is_unexplained and k in cameras.without_focal else estimate
-        is_odd = is_unexplained or varies or estimate.field.size > 0
+        is_odd = is_unexplained or doubted or estimate.field.size > 0
         if estimate.lens == "pinhole" and is_odd and fisheye_apart_px(wide) > MOST_FIELD_PX:
             changed[k] = replace(camera, K=wide.K, dist=np.zeros(0), lens="fisheye")
             labels.append(cameras.labels[k])

@@ -13,6 +13,7 @@ from typing import Any
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
+from ..bundle.held_out import MIN_FALL
 from ..bundle.intrinsics import check_lenses
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
@@ -249,7 +250,7 @@ def _as_fisheyes(loaded: LoadedPhotos, solved: Solved, _options: SolveOptions) -
     """Cameras of another lens, as `cameras_as_fisheyes`."""
     varies = solved.choice is not None and solved.choice.varying
     return cameras_as_fisheyes(
-        loaded.cameras, solved.shared.cameras, is_unexplained=_is_unexplained(solved), varies=varies
+        loaded.cameras, solved.shared.cameras, is_unexplained=_is_unexplained(solved), doubted=varies
     )
 
 
@@ -307,7 +308,8 @@ def _is_explained(other: Solved, before: Solved) -> bool:
 
 
 # What else cameras may be, and when that is kept.
-_OTHER_CAMERAS = (_as_fisheyes, _is_explained), (_if_stretched, _is_explained), (_by_zoom, _is_better)
+# The stretch is asked first: what bends stretched photos may look like a fisheye.
+_OTHER_CAMERAS = (_if_stretched, _is_explained), (_as_fisheyes, _is_explained), (_by_zoom, _is_better)
 
 
 def _solve(
@@ -383,7 +385,44 @@ def solve_frames(
     log: StageLog,
     kept: Kept | None = None,
 ) -> Solved:
-    """The result of a video and a gyroscope's log."""
+    """The result of a video and a gyroscope's log; as of a fisheye, if no pinhole lens explains its frames as well."""
+    solve = partial(_solve_frames, options, clip, bodies=bodies, gyro_log=gyro_log, log=log)
+    with _saying() as said:
+        solved = solve(keys, kept=kept)
+        # a video shows what little a lens leaves, and its path absorbs some: each wide view is tried
+        apart = cameras_as_fisheyes(keys.cameras, solved.shared.cameras, is_unexplained=False, doubted=True)
+        if apart is None:
+            return solved
+        cameras, notes = apart
+        before, other = [*said], None
+        said.clear()
+        with suppress(ReconstructionError, InputError):
+            other = solve(replace(keys, cameras=cameras), kept=None)
+        if other is None or not _fits_better(other, solved):
+            said[:] = before
+            return solved
+    for note in notes:
+        warnings.warn(note, RsUndistortWarning, stacklevel=3)
+    return other
+
+
+def _fits_better(other: Solved, before: Solved) -> bool:
+    """Whether a path through as many frames leaves less, by more than noise may."""
+    assert other.whole is not None and before.whole is not None
+    fewer = other.whole.num_images < before.whole.num_images
+    return not fewer and bool(other.result.sigma_px**2 < (1 - MIN_FALL) * before.result.sigma_px**2)
+
+
+def _solve_frames(
+    options: RunOptions,
+    clip: Clip,
+    keys: LoadedPhotos,
+    bodies: Sequence[ExifFacts | VideoFrames],
+    gyro_log: GyroLog | None,
+    log: StageLog,
+    kept: Kept | None,
+) -> Solved:
+    """The result of a video by these cameras."""
     solving, cameras = options.solve, keys.cameras
     at_once = solving.shutter_model == "global"
     around_s = 0.0 if options.gyro is None else options.gyro.offset_s
