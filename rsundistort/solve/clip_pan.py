@@ -22,7 +22,7 @@ from ..sfm.features import Features
 from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
 
-__all__ = ["as_directions", "lens_shows_px", "rotating_only", "rotation_between", "seen_again"]
+__all__ = ["as_directions", "lens_shows_px", "rotates_by", "rotating_only", "rotation_between", "seen_again"]
 
 _Corners = tuple[Array, Array]
 
@@ -56,8 +56,7 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     from rotations by more than a shutter explains.
     """
     camera = keys.cameras.of(0)
-    step = np.array([camera.width, camera.height]) / flow_size(camera.width, camera.height)
-    corners = [(step * (each.first_xy + 0.5) - 0.5, step * (each.second_xy + 0.5) - 0.5) for each in clip.flows]
+    corners = _corners(clip, camera)
     if corners and keys.cameras.without_focal:
         camera = _with_likeliest_lens(corners, camera)
     # corners of key frames show it in no time, so that the frames between need not be followed
@@ -69,6 +68,21 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     if chained is None or 2 * len(chained[2]) < len(clip.names):
         return None
     return _joined(clip, camera, chained[0], shown, *chained[1:])
+
+
+def rotates_by(clip: Clip, camera: Camera) -> bool:
+    """Whether rotations explain corners of key frames and the next ones by such a lens of any focal length."""
+    corners = _corners(clip, camera)
+    if not corners:
+        return False
+    camera = _with_likeliest_lens(corners, camera)
+    return _only_rotates([_beyond_rotation(first, second, camera) for first, second in corners], camera)
+
+
+def _corners(clip: Clip, camera: Camera) -> list[_Corners]:
+    """Corners of key frames, and where the next ones show them, in pixels."""
+    step = np.array([camera.width, camera.height]) / flow_size(camera.width, camera.height)
+    return [(step * (each.first_xy + 0.5) - 0.5, step * (each.second_xy + 0.5) - 0.5) for each in clip.flows]
 
 
 def _with_likeliest_lens(corners: Sequence[_Corners], camera: Camera) -> Camera:

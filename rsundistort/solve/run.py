@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
@@ -36,6 +38,7 @@ from ..io.video import VIDEO_SUFFIXES, VideoFrames
 from ..model import Reconstruction, Solution
 from ..model.checks import check_kind
 from ..verdict.judge import unexplained_reasons
+from .clip_pan import rotates_by
 from .going_on import RunFolder, key_of, run_folder
 from .known_contradiction import known_contradiction
 from .model_sequence import solve_photos
@@ -388,27 +391,52 @@ def solve_frames(
     """The result of a video and a gyroscope's log; as of a fisheye, if no pinhole lens explains its frames as well."""
     solve = partial(_solve_frames, options, clip, bodies=bodies, gyro_log=gyro_log, log=log)
     with _saying() as said:
-        solved = solve(keys, kept=kept)
-        # a video shows what little a lens leaves, and its path absorbs some: each wide view is tried
-        apart = cameras_as_fisheyes(keys.cameras, solved.shared.cameras, is_unexplained=False, doubted=True)
-        if apart is None:
-            return solved
-        cameras, notes = apart
-        before, other = [*said], None
-        said.clear()
-        with suppress(ReconstructionError, InputError):
-            other = solve(replace(keys, cameras=cameras), kept=None)
-        if other is None or not _fits_better(other, solved):
-            said[:] = before
-            return solved
-    for note in notes:
-        warnings.warn(note, RsUndistortWarning, stacklevel=3)
-    return other
+        found, failed = None, None
+        try:
+            found = solve(keys, kept=kept)
+        except ReconstructionError as error:
+            failed = error
+        apart = _wide_lens(clip, keys.cameras, found)
+        other, before = None, [*said]
+        if apart is not None:
+            said.clear()
+            with suppress(ReconstructionError, InputError):
+                other = solve(replace(keys, cameras=apart[0]), kept=None)
+        if apart is not None and other is not None and _fits_better(other, found):
+            for note in apart[1]:
+                warnings.warn(note, RsUndistortWarning, stacklevel=3)
+            return other
+        said[:] = before
+        if failed is not None:
+            raise failed
+    assert found is not None
+    return found
 
 
-def _fits_better(other: Solved, before: Solved) -> bool:
-    """Whether a path through as many frames leaves less, by more than noise may."""
-    assert other.whole is not None and before.whole is not None
+def _wide_lens(clip: Clip, cameras: PhotoCameras, found: Solved | None) -> tuple[PhotoCameras, list[str]] | None:
+    """The camera of a video as a fisheye, where it may be one, as `cameras_as_fisheyes`.
+
+    A video shows what little a lens leaves, and its path absorbs some: each wide view is tried. Of that, rotations say
+    little, and an error nothing; nor does a scene, if rotations of a fisheye explain it.
+    """
+    wide_view = partial(cameras_as_fisheyes, cameras, doubted=True)
+    if found is None:
+        return wide_view(cameras.cameras, is_unexplained=True)
+    of_found = found.shared.cameras
+    if cameras.without_focal:
+        any_view = wide_view(of_found, is_unexplained=True)
+        rotates = not np.ptp(found.shared.center_w, axis=0).any()
+        if any_view is not None and (rotates or rotates_by(clip, any_view[0].of(0))):
+            return any_view
+    return wide_view(of_found, is_unexplained=False)
+
+
+def _fits_better(other: Solved, before: Solved | None) -> bool:
+    """Whether a path through as many frames leaves less, by more than noise may; can be trusted, if there is none."""
+    assert other.whole is not None
+    if before is None:
+        return other.verdict is not None and other.verdict.shape == "trusted"
+    assert before.whole is not None
     fewer = other.whole.num_images < before.whole.num_images
     return not fewer and bool(other.result.sigma_px**2 < (1 - MIN_FALL) * before.result.sigma_px**2)
 
