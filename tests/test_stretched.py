@@ -71,9 +71,12 @@ def test_square_pixels_and_a_lens_that_varies_stay(rng):
     assert cameras_if_stretched(cameras(), varied, OPTIONS, is_unexplained=False) is None
 
 
-def test_photos_that_are_explained_are_not_asked(rng):
-    stretched = solved_by(photographed(rng, 0.97), varying=False)
-    assert cameras_if_stretched(cameras(), stretched, OPTIONS, is_unexplained=False) is None
+def test_photos_that_are_explained_take_what_leaves_less(rng):
+    for width, is_stretched in ((0.97, True), (1.0, False)):
+        found = cameras_if_stretched(
+            cameras(), solved_by(photographed(rng, width), varying=False), OPTIONS, is_unexplained=False
+        )
+        assert (found is not None) == is_stretched
 
 
 @pytest.mark.parametrize(

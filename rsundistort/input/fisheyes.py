@@ -11,7 +11,7 @@ from ..model import Camera
 from ..model.field import MOST_FIELD_PX, fisheye_apart_px
 from .photo_cameras import PhotoCameras
 
-__all__ = ["cameras_as_fisheyes"]
+__all__ = ["cameras_as_fisheyes", "cameras_as_pinholes"]
 
 # Focal length of an equidistant fisheye of 180 degrees from corner to corner, as a share of the diagonal.
 _FULL_FRAME = 1.0 / np.pi
@@ -55,6 +55,25 @@ def cameras_as_fisheyes(
         for label in labels
     ]
     return (replace(cameras, cameras=tuple(changed)), notes) if notes else None
+
+
+def cameras_as_pinholes(cameras: PhotoCameras, found: Sequence[Camera]) -> PhotoCameras | None:
+    """The cameras after fisheyes that a pinhole lens follows as well became such; None if there are none.
+
+    Photos by which no pinhole lens was found may have one all the same: a fisheye's coefficients follow its tangent.
+
+    Parameters
+    ----------
+    found : sequence of Camera
+        Estimates of the same cameras, whose focal lengths are taken.
+    """
+    changed = [
+        replace(camera, K=estimate.K, dist=np.zeros(0), lens="pinhole")
+        if estimate.lens == "fisheye" and fisheye_apart_px(estimate) <= MOST_FIELD_PX
+        else camera
+        for camera, estimate in zip(cameras.cameras, found, strict=True)
+    ]
+    return None if changed == [*cameras.cameras] else replace(cameras, cameras=tuple(changed))
 
 
 def _at_most(camera: Camera, share: float) -> Camera:

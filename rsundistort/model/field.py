@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MOST_FIELD_PX",
+    "PINHOLE_ENDS",
     "add_field",
     "excess_px",
     "field_basis",
@@ -41,8 +42,10 @@ _LOOKED_AT = 33
 _STEEPEST = 0.5
 #: Largest field beside a lens model, root mean square over the frame: with more, it is not the model of this lens.
 MOST_FIELD_PX = 0.5
-# A pinhole lens ends before 90 degrees.
-_PINHOLE_ENDS = np.radians(85.0)
+# Angles from the axis between which a fisheye's radii are interpolated.
+_ANGLES = 2000
+#: A pinhole lens ends before 90 degrees.
+PINHOLE_ENDS = np.radians(85.0)
 
 
 def _splines(u: Array, count: int, slope: bool = False) -> Array:
@@ -134,14 +137,17 @@ def excess_px(camera: Camera) -> float:
 
 
 def fisheye_apart_px(camera: Camera) -> float:
-    """By how many pixels an equidistant fisheye of this focal length differs from the nearest pinhole lens.
+    """By how many pixels a fisheye differs from the nearest pinhole lens; of a pinhole camera, an equidistant one.
 
     Root mean square over what lies ahead of the camera, after k1, k2, k3 and another focal length.
     """
     x, y = ((np.arange(_LOOKED_AT) + 0.5) / _LOOKED_AT * side - 0.5 for side in (camera.width, camera.height))
     radius = np.hypot(*np.meshgrid(x - camera.K[0, 2], y - camera.K[1, 2])).ravel() / camera.K[0, 0]
-    radius = radius[radius < _PINHOLE_ENDS]
-    tan = np.tan(radius)[:, None] ** [1, 3, 5, 7]
+    angles = np.linspace(0.0, PINHOLE_ENDS, _ANGLES)
+    dist = camera.dist if camera.lens == "fisheye" else np.zeros(0)
+    radii = np.maximum.accumulate(angles * (1.0 + angles[:, None] ** (2 * np.arange(1, len(dist) + 1)) @ dist))
+    radius = radius[radius < radii[-1]]
+    tan = np.tan(np.interp(radius, radii, angles))[:, None] ** [1, 3, 5, 7]
     tan /= np.linalg.norm(tan, axis=0)
     apart = tan @ np.linalg.lstsq(tan, radius)[0] - radius
     return float(camera.K[0, 0] * np.sqrt((apart**2).mean()))

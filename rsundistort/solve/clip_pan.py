@@ -16,6 +16,7 @@ from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.array_types import Array, Index
+from ..model.field import PINHOLE_ENDS
 from ..model.projection import project_points, unproject_points
 from ..sfm.descriptor_matches import DescriptorIndex, match_descriptors
 from ..sfm.features import Features
@@ -324,6 +325,7 @@ def _left_by_shutter(before: Array, after: Array, camera: Camera) -> float:
 def _sizes_beyond_shutter(before: Array, after: Array, camera: Camera) -> Array | None:
     """(n,) those distances, in the tangent plane; NaN where there is no direction, None if there are too few."""
     seen = np.asarray(np.isfinite(np.hstack([before, after])).all(axis=1))
+    seen[seen] = np.minimum(before[seen, 2], after[seen, 2]) > np.cos(PINHOLE_ENDS)  # that plane is endless
     if seen.sum() < _LEAST_AGREEING:
         return None
     before, after = before[seen], after[seen]

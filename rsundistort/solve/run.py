@@ -15,11 +15,10 @@ import numpy as np
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
-from ..bundle.held_out import MIN_FALL
 from ..bundle.intrinsics import check_lenses
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
-from ..input.fisheyes import cameras_as_fisheyes
+from ..input.fisheyes import cameras_as_fisheyes, cameras_as_pinholes
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_readouts
 from ..input.key_frames import Clip
@@ -57,7 +56,7 @@ from .run_outputs import (
     photo_times,
     remove_former,
 )
-from .solutions import explains_most, explains_variation
+from .solutions import explains_most, explains_variation, leaves_less
 from .stretched import cameras_if_stretched
 from .survey import clocks_of, survey_of
 from .tracks import of_registered
@@ -304,10 +303,16 @@ def _is_better(other: Solved, before: Solved) -> bool:
 
 
 def _is_explained(other: Solved, before: Solved) -> bool:
-    """Whether a solution explains most of what another leaves of as many photos, or as much without varying."""
+    """Whether a solution explains most of what another leaves of as many photos, or as much without varying.
+
+    If the other one leaves no more than noise does, it is explained if anything less is left.
+    """
     fewer = len(other.shared.image_names) < len(before.shared.image_names)
     results = other.result, before.result
-    return not fewer and (explains_most(*results) or explains_variation(*results))
+    is_odd = _is_unexplained(before) or before.shared.varies or any(each.field.size for each in before.shared.cameras)
+    return not fewer and (
+        explains_most(*results) or explains_variation(*results) or (not is_odd and leaves_less(*results))
+    )
 
 
 # What else cameras may be, and when that is kept.
@@ -396,13 +401,18 @@ def solve_frames(
             found = solve(keys, kept=kept)
         except ReconstructionError as error:
             failed = error
-        apart = _wide_lens(clip, keys.cameras, found)
-        other, before = None, [*said]
+        apart, other, before = _wide_lens(clip, keys.cameras, found), None, [*said]
         if apart is not None:
             said.clear()
             with suppress(ReconstructionError, InputError):
                 other = solve(replace(keys, cameras=apart[0]), kept=None)
         if apart is not None and other is not None and _fits_better(other, found):
+            pinholes, by_fisheye = cameras_as_pinholes(apart[0], other.shared.cameras), [*said]
+            if pinholes is not None:
+                said.clear()
+                with suppress(ReconstructionError, InputError):
+                    return solve(replace(keys, cameras=pinholes), kept=None)
+            said[:] = by_fisheye
             for note in apart[1]:
                 warnings.warn(note, RsUndistortWarning, stacklevel=3)
             return other
@@ -438,7 +448,7 @@ def _fits_better(other: Solved, before: Solved | None) -> bool:
         return other.verdict is not None and other.verdict.shape == "trusted"
     assert before.whole is not None
     fewer = other.whole.num_images < before.whole.num_images
-    return not fewer and bool(other.result.sigma_px**2 < (1 - MIN_FALL) * before.result.sigma_px**2)
+    return not fewer and leaves_less(other.result, before.result)
 
 
 def _solve_frames(

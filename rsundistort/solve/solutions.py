@@ -19,6 +19,7 @@ __all__ = [
     "consistent",
     "explains_most",
     "explains_variation",
+    "leaves_less",
     "num_explained",
     "num_of_one_scale",
     "photos_apart",
@@ -90,6 +91,11 @@ def same_places(rec: Reconstruction, other: Reconstruction) -> bool:
 def explains_most(other: BundleResult, before: BundleResult) -> bool:
     """Whether one result explains most of what another leaves."""
     return bool(2 * other.sigma_px**2 < before.sigma_px**2)
+
+
+def leaves_less(other: BundleResult, before: BundleResult) -> bool:
+    """Whether one result leaves less than another, by more than noise may."""
+    return bool(other.sigma_px**2 < (1 - MIN_FALL) * before.sigma_px**2)
 
 
 def explains_variation(other: BundleResult, before: BundleResult) -> bool:

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
-from ..bundle.held_out import MIN_FALL
 from ..errors import ReconstructionError
 from ..input.photo_cameras import GUESS_SIGMA, PhotoCameras
 from .outcome import Solved
 from .run_options import SolveOptions
-from .solutions import explains_most, explains_variation
+from .solutions import explains_most, explains_variation, leaves_less
 from .tracks import rough_options
 
 __all__ = ["cameras_if_stretched"]
@@ -24,13 +23,15 @@ def cameras_if_stretched(
     """The cameras of photos with another fx than fy, if one stretch of all photos explains what was found, or left.
 
     Square pixels bend stretched photos by what each shows, so that motions and a lens that varies take it up. One
-    adjustment with the measurements at hand tells: it has one unknown in place of these.
+    adjustment with the measurements at hand tells: it has one unknown in place of these. Photos whose pixels are square
+    leave as much with it, to 0.2 %.
 
     Parameters
     ----------
     is_unexplained : bool
-        Whether what was found leaves more of the photos than noise, or no shutter is determined. Photos that need a
-        lens that varies, or a residual field, are asked, too; others are not.
+        Whether what was found leaves more of the photos than noise, or no shutter is determined. Of such photos, and
+        those that need a lens that varies or a residual field, a stretch has to explain most, or the variation: it may
+        take up a part of anything. Others must leave less by it.
 
     Returns
     -------
@@ -41,7 +42,7 @@ def cameras_if_stretched(
     """
     rec, given = solved.shared, cameras.sigma or [{}] * len(cameras.cameras)
     is_odd = is_unexplained or rec.varies or any(camera.field.size for camera in rec.cameras)
-    if cameras.calibrated or not is_odd or any("fx" in each for each in given):
+    if cameras.calibrated or any("fx" in each for each in given):
         return None
     usual = GUESS_SIGMA["f"]
     sigma = [{**each, "fx": each.get("f", usual), "fy": each.get("f", usual)} for each in given]
@@ -51,7 +52,8 @@ def cameras_if_stretched(
     except ReconstructionError:
         return None
     explained = explains_most(other, solved.result) or explains_variation(other, solved.result)
-    if not explained or other.sigma_px**2 >= (1 - MIN_FALL) * square.sigma_px**2:
+    explained = explained or (not is_odd and leaves_less(other, solved.result))
+    if not explained or not leaves_less(other, square):
         return None
     found, notes = [], list[str]()
     for camera, estimate, label in zip(cameras.cameras, other.reconstruction.cameras, cameras.labels, strict=True):
