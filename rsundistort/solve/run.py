@@ -395,23 +395,26 @@ def solve_frames(
 ) -> Solved:
     """The result of a video and a gyroscope's log; as of a fisheye, if no pinhole lens explains its frames as well."""
     solve = partial(_solve_frames, options, clip, bodies=bodies, gyro_log=gyro_log, log=log)
+    found, failed = None, None
     with _saying() as said:
-        found, failed = None, None
+
+        def tried(cameras: PhotoCameras) -> Solved | None:
+            said.clear()
+            with suppress(ReconstructionError, InputError):
+                return solve(replace(keys, cameras=cameras), kept=None)
+            return None
+
         try:
             found = solve(keys, kept=kept)
         except ReconstructionError as error:
             failed = error
-        apart, other, before = _wide_lens(clip, keys.cameras, found), None, [*said]
-        if apart is not None:
-            said.clear()
-            with suppress(ReconstructionError, InputError):
-                other = solve(replace(keys, cameras=apart[0]), kept=None)
+        before, apart = [*said], _wide_lens(clip, keys.cameras, found)
+        other = None if apart is None else tried(apart[0])
         if apart is not None and other is not None and _fits_better(other, found):
-            pinholes, by_fisheye = cameras_as_pinholes(apart[0], other.shared.cameras), [*said]
-            if pinholes is not None:
-                said.clear()
-                with suppress(ReconstructionError, InputError):
-                    return solve(replace(keys, cameras=pinholes), kept=None)
+            by_fisheye, pinholes = [*said], cameras_as_pinholes(apart[0], other.shared.cameras)
+            as_pinhole = None if pinholes is None else tried(pinholes)
+            if as_pinhole is not None:
+                return as_pinhole
             said[:] = by_fisheye
             for note in apart[1]:
                 warnings.warn(note, RsUndistortWarning, stacklevel=3)
@@ -433,6 +436,8 @@ def _wide_lens(clip: Clip, cameras: PhotoCameras, found: Solved | None) -> tuple
     if found is None:
         return wide_view(cameras.cameras, is_unexplained=True)
     of_found = found.shared.cameras
+    if found.evidence.get("stands"):  # any lens explains it
+        return None
     if cameras.without_focal:
         any_view = wide_view(of_found, is_unexplained=True)
         rotates = not np.ptp(found.shared.center_w, axis=0).any()
