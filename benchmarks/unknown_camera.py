@@ -133,8 +133,8 @@ def without_camera(recipe: dict[str, Any], folder: Path, taken: str, name: str) 
         "lens": solution.cameras[solution.registered[0].camera_id].lens,
         "f_ratio": round(focal(solution) / recipe["camera"]["K"][0][0], 5),
         "registered": result.registered,
-        "rotation_deg": round(result.rotation_deg.median, 4),
-        "psnr_db": round(result.psnr_db.median, 2) if result.psnr_db else None,
+        "rotation_deg": None if result.rotation_deg is None else round(result.rotation_deg.median, 4),
+        "psnr_db": None if result.psnr_db is None else round(result.psnr_db.median, 2),
     }
     time = solution.quality.get("readout_time")
     if time:

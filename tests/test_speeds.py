@@ -142,5 +142,24 @@ def test_a_fast_vibration_shows_also_where_frames_are_missing(rng, without, hz):
     assert abs(slow.seconds - 0.02) < 4 * slow.sigma
 
 
+@pytest.mark.parametrize("errors", [0.0, 6e-4])
+def test_errors_of_the_frames_rotations_are_no_vibration(rng, errors):
+    """A hand that rotates slowly: it trembles, or its frames are off by more than their standard deviations."""
+    hand, trembles = HandHeld(3), 2 * np.pi * 0.37 / FRAME_S
+    off, size = errors * rng.normal(size=(60, 3)), 2e-3 * (errors == 0)
+
+    def rotations(time_s):
+        angle = trembles * np.asarray(time_s)[:, None] + [0.0, 1.0, 2.0]
+        return Rotation.from_rotvec(size * np.sin(angle)).as_matrix() @ hand.rotations(np.asarray(time_s) / 4)
+
+    time_s = np.arange(60) * FRAME_S
+    R_cw, phi = lines_of(rotations, time_s, 0.02)
+    sigma = np.full((60, 3), NOISE)
+    R_cw = Rotation.from_rotvec(off).as_matrix() @ R_cw
+    found = readouts_by_speed(time_s, np.zeros(60, int), R_cw, sigma, phi + rng.normal(0, NOISE, (60, 3)), sigma, 0.02)
+    assert (found.fast is None) == (errors > 0)
+    assert abs(found.slow.seconds - 0.02) < 0.1 * 0.02
+
+
 def test_frames_of_which_most_are_missing_are_not_filled_in(rng):
     assert by_speed(shaken(1, 9.0, 0.003), rng, num=90, without=np.flatnonzero(np.arange(90) % 5 > 2)) is None

@@ -29,6 +29,8 @@ _MORE = 1.1
 _LEAST_PERIODS = 2
 # A Hann window spreads each rotation over three frequencies: what is left of neighbours goes together.
 _TOGETHER = 1.5
+# Share of the power of frames' rotations that lines have at least, if the camera rotated so: all of it.
+_IN_LINES = 0.5
 # Standard deviations of the noise's power beyond which lines show what frames do not.
 _BEYOND = 3.0
 
@@ -46,7 +48,8 @@ class BySpeed(NamedTuple):
     Attributes
     ----------
     slow, fast : ReadoutTime or None
-        The readout times by them; None if that kind of rotation is lost in the noise.
+        The readout times by them; None if that kind of rotation is lost in the noise. That of fast ones is none, too,
+        if frames show them, and lines do not.
     unfollowed : float
         Share of the power of the lines' rotations that is not in those of the frames at the readout time by slow ones,
         significantly beyond the noise of both: 0 if they agree, 1 or more if they have nothing to do with each other.
@@ -164,6 +167,8 @@ def _compared(runs: Sequence[_Run], readout_s: float, step_s: float) -> BySpeed:
         _slope(lines[mine], rates[mine], line_noise[mine], rate_noise[mine], readout_s) for mine in (~fast, fast)
     )
     by_slow = 0.0 if slow is None else slow.seconds
+    if not _in_lines(lines[fast], rates[fast], line_noise[fast], rate_noise[fast], by_slow):
+        rest = None
     noise = by_slow**2 * rate_noise + line_noise
     left = float((np.abs(lines - by_slow * rates) ** 2 - noise).sum())
     # of frames that hardly rotate the noise alone leaves a share; its power at a frequency scatters by itself
@@ -230,6 +235,19 @@ def _spectra(run: _Run, readout_s: float) -> tuple[Mask, NDArray[np.complex128],
     line_noise = np.broadcast_to(window**2 @ of_lines, rate_noise.shape)
     fast = frequency > 0.25 / step_s
     return fast, waves @ (window[:, None] * phi), rates, line_noise, rate_noise * shown[:, None] ** 2
+
+
+def _in_lines(
+    lines: NDArray[np.complex128], rates: NDArray[np.complex128], line_noise: Array, rate_noise: Array, about: float
+) -> bool:
+    """Whether lines rotate as much as frames do at these frequencies, by a readout time.
+
+    A vibration faster than half of the frame rate shows in the lines, and as a slower one in the frames. What only the
+    frames show are their errors, which a scene that is seen from a small way leaves in their rotations.
+    """
+    weight = 1.0 / (line_noise + about**2 * rate_noise)
+    of_lines = float((weight * (np.abs(lines) ** 2 - line_noise)).sum())
+    return of_lines >= _IN_LINES * about**2 * float((weight * (np.abs(rates) ** 2 - rate_noise)).sum())
 
 
 def _slope(
