@@ -56,7 +56,7 @@ from .run_outputs import (
     photo_times,
     remove_former,
 )
-from .solutions import explains_most, explains_variation, leaves_less
+from .solutions import explains_most, explains_variation, leaves_less, leaves_no_more
 from .stretched import cameras_if_stretched
 from .survey import clocks_of, survey_of
 from .tracks import of_registered
@@ -440,20 +440,28 @@ def _wide_lens(clip: Clip, cameras: PhotoCameras, found: Solved | None) -> tuple
         return None
     if cameras.without_focal:
         any_view = wide_view(of_found, is_unexplained=True)
-        rotates = not np.ptp(found.shared.center_w, axis=0).any()
-        if any_view is not None and (rotates or rotates_by(clip, any_view[0].of(0))):
+        if any_view is not None and (_only_rotates(found) or rotates_by(clip, any_view[0].of(0))):
             return any_view
     return wide_view(of_found, is_unexplained=False)
 
 
 def _fits_better(other: Solved, before: Solved | None) -> bool:
-    """Whether a path through as many frames leaves less, by more than noise may; can be trusted, if there is none."""
-    assert other.whole is not None
+    """Whether a path through as many frames leaves less, by more than noise may, or no more without any travel.
+
+    Whether it can be trusted, if there is none before it.
+    """
     if before is None:
         return other.verdict is not None and other.verdict.shape == "trusted"
-    assert before.whole is not None
-    fewer = other.whole.num_images < before.whole.num_images
-    return not fewer and leaves_less(other.result, before.result)
+    assert other.whole is not None and before.whole is not None
+    results = other.result, before.result
+    no_travel = _only_rotates(other) and not _only_rotates(before)
+    fits = leaves_less(*results) or (no_travel and leaves_no_more(*results))
+    return fits and other.whole.num_images >= before.whole.num_images
+
+
+def _only_rotates(solved: Solved) -> bool:
+    """Whether the frames of a video have directions only."""
+    return not np.ptp(solved.shared.center_w, axis=0).any()
 
 
 def _solve_frames(

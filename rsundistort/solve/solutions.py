@@ -20,6 +20,7 @@ __all__ = [
     "explains_most",
     "explains_variation",
     "leaves_less",
+    "leaves_no_more",
     "num_explained",
     "num_of_one_scale",
     "photos_apart",
@@ -98,7 +99,11 @@ def leaves_less(other: BundleResult, before: BundleResult) -> bool:
     return bool(other.sigma_px**2 < (1 - MIN_FALL) * before.sigma_px**2)
 
 
+def leaves_no_more(other: BundleResult, before: BundleResult) -> bool:
+    """Whether one result leaves no more than another, but for what noise may."""
+    return bool(other.sigma_px**2 <= (1 + MIN_FALL) * before.sigma_px**2)
+
+
 def explains_variation(other: BundleResult, before: BundleResult) -> bool:
     """Whether one result leaves no more than another, but for what noise may, which needs a lens that varies for it."""
-    no_more = bool(other.sigma_px**2 <= (1 + MIN_FALL) * before.sigma_px**2)
-    return no_more and before.reconstruction.varies and not other.reconstruction.varies
+    return leaves_no_more(other, before) and before.reconstruction.varies and not other.reconstruction.varies

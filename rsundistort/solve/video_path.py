@@ -283,7 +283,10 @@ def _rotated_as_filmed(
     if own is None:
         return None
     held = held_by_slow_rotations(clip, result.reconstruction, path, own)
-    result, options = _rotated_again(result, replace(options, path=held), log)
+    for _ in range(_LENS_ROUNDS):  # what was an outlier by one lens is none by another
+        before, (result, options) = result, _rotated_again(result, replace(options, path=held), log)
+        if not is_other_lens(result, before.reconstruction.cameras[0], _MAPPED_BY):
+            break
     # what a rough path does not follow, a better one may
     if held.held_sigma and not _is_held(clip, path, result):
         result, options = _rotated_again(result, replace(options, path=path), log)
