@@ -452,7 +452,8 @@ def _fits_better(other: Solved, before: Solved | None) -> bool:
     """
     if before is None:
         return other.verdict is not None and other.verdict.shape == "trusted"
-    assert other.whole is not None and before.whole is not None
+    assert other.whole is not None
+    assert before.whole is not None
     results = other.result, before.result
     no_travel = _only_rotates(other) and not _only_rotates(before)
     fits = leaves_less(*results) or (no_travel and leaves_no_more(*results))
