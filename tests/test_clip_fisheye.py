@@ -55,8 +55,10 @@ def solve(monkeypatch):
     def solve(*results, rotates=False, cameras=(GUESS,), without_focal=(0,), calibrated=False):
         asked, left = [], [*results]
 
-        def solved(_options, _clip, keys, **_):
+        def solved(_options, _clip, keys, *, rotates=False, **_):
             asked.append(keys.cameras.of(0))
+            if rotates:
+                assert asked[-1].lens == "fisheye"
             if left[0] is None:
                 left.pop(0)
                 raise ReconstructionError("the photos do not determine their camera")
@@ -110,8 +112,12 @@ def test_other_videos_are_not(solve, found, changes):
 def test_what_rotations_of_a_fisheye_explain_is_tried_as_one(solve, center_w, sigma_px):
     """And a scene that leaves as much is none."""
     by_fisheye, by_pinhole = result_of(FISHEYE, sigma_px, ROTATES), result_of(camera_of(680), 0.04, center_w)
-    found, asked, _ = solve(by_pinhole, by_fisheye, rotates=center_w is TRAVELS)
+    found, asked, said = solve(by_pinhole, by_fisheye, by_fisheye, rotates=center_w is TRAVELS)
     assert found is by_fisheye
+    assert len(said) == 2
+    assert len(asked) == 3  # whether it travelled is asked by that lens again
+    hovers = result_of(FISHEYE, sigma_px, TRAVELS)
+    assert solve(by_pinhole, by_fisheye, hovers, rotates=center_w is TRAVELS)[0] is hovers
     assert asked[1].K[0, 0] == pytest.approx(np.hypot(640, 360) / np.pi)
     worse = result_of(FISHEYE, 0.042, ROTATES)
     assert solve(by_pinhole, worse, rotates=center_w is TRAVELS)[0] is by_pinhole

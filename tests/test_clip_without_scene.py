@@ -138,6 +138,17 @@ def test_the_clock_of_a_log_is_looked_for_around_the_offset_that_is_given(solve,
         solve_frames(options, CLIP, keys, [], GyroLog([71.0, 72.0], np.ones((2, 3))), StageLog(None))
 
 
+def test_a_camera_that_is_to_rotate_only_has_no_scene(solve, monkeypatch):
+    solve(TURNED, explained=True, scene=TRAVELLED)
+    monkeypatch.setattr(video_path, "_travelled", lambda *_: pytest.fail("a scene was looked for"))
+    keys = keys_of(Camera(64, 36, np.eye(3)))
+    with pytest.warns(RsUndistortWarning, match="only rotated"):
+        assert video_path.solve_clip(CLIP, keys, PATH, None, None, StageLog(None), rotates=True) == TURNED
+    monkeypatch.setattr(video_path, "_only_rotated", lambda *_: (None, ""))
+    with pytest.raises(ReconstructionError, match="rotations do not explain the frames"):
+        video_path.solve_clip(CLIP, keys, PATH, None, None, StageLog(None), rotates=True)
+
+
 def test_without_them_the_error_says_what_is_missing(solve):
     with pytest.raises(ReconstructionError, match="no scene point"):
         solve(None, explained=False)
@@ -187,7 +198,7 @@ NOTHING = ReadoutTime(0.01, 0.01)
     ],
 )  # fmt: skip
 def test_the_lines_of_frames_that_stand_are_those_that_fit(monkeypatch, camera, specified, by_direction, expected):
-    def filmed(clip, keys, *_):
+    def filmed(clip, keys, *_, **__):
         found = by_direction[keys.cameras.of(0).readout]
         if found is None:
             raise InputError("it does not fit at all")
@@ -202,7 +213,7 @@ def test_the_lines_of_frames_that_stand_are_those_that_fit(monkeypatch, camera, 
 
 
 def test_frames_that_fit_along_no_axis_say_why(monkeypatch):
-    def filmed(*_):
+    def filmed(*_, **__):
         raise ReconstructionError("no scene point could be triangulated")
 
     monkeypatch.setattr(video_path, "_filmed_by", filmed)

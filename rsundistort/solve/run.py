@@ -398,19 +398,21 @@ def solve_frames(
     found, failed = None, None
     with _saying() as said:
 
-        def tried(cameras: PhotoCameras) -> Solved | None:
+        def tried(cameras: PhotoCameras, *, rotates: bool = False) -> Solved | None:
             said.clear()
             with suppress(ReconstructionError, InputError):
-                return solve(replace(keys, cameras=cameras), kept=None)
+                return solve(replace(keys, cameras=cameras), kept=None, rotates=rotates)
             return None
 
         try:
             found = solve(keys, kept=kept)
         except ReconstructionError as error:
             failed = error
-        before, apart = [*said], _wide_lens(clip, keys.cameras, found)
-        other = None if apart is None else tried(apart[0])
+        before, (apart, rotates) = [*said], _wide_lens(clip, keys.cameras, found)
+        other = None if apart is None else tried(apart[0], rotates=rotates)
         if apart is not None and other is not None and _fits_better(other, found):
+            if rotates:  # and whether it travelled, too, as what only rotates may look
+                other = tried(apart[0]) or other
             by_fisheye, pinholes = [*said], cameras_as_pinholes(apart[0], other.shared.cameras)
             as_pinhole = None if pinholes is None else tried(pinholes)
             if as_pinhole is not None:
@@ -426,23 +428,25 @@ def solve_frames(
     return found
 
 
-def _wide_lens(clip: Clip, cameras: PhotoCameras, found: Solved | None) -> tuple[PhotoCameras, list[str]] | None:
-    """The camera of a video as a fisheye, where it may be one, as `cameras_as_fisheyes`.
+def _wide_lens(
+    clip: Clip, cameras: PhotoCameras, found: Solved | None
+) -> tuple[tuple[PhotoCameras, list[str]] | None, bool]:
+    """The camera of a video as a fisheye, where it may be one, as `cameras_as_fisheyes`; and if it is to rotate only.
 
     A video shows what little a lens leaves, and its path absorbs some: each wide view is tried. Of that, rotations say
     little, and an error nothing; nor does a scene, if rotations of a fisheye explain it.
     """
     wide_view = partial(cameras_as_fisheyes, cameras, doubted=True)
     if found is None:
-        return wide_view(cameras.cameras, is_unexplained=True)
+        return wide_view(cameras.cameras, is_unexplained=True), False
     of_found = found.shared.cameras
     if found.evidence.get("stands"):  # any lens explains it
-        return None
+        return None, False
     if cameras.without_focal:
         any_view = wide_view(of_found, is_unexplained=True)
         if any_view is not None and (_only_rotates(found) or rotates_by(clip, any_view[0].of(0))):
-            return any_view
-    return wide_view(of_found, is_unexplained=False)
+            return any_view, True
+    return wide_view(of_found, is_unexplained=False), False
 
 
 def _fits_better(other: Solved, before: Solved | None) -> bool:
@@ -473,8 +477,10 @@ def _solve_frames(
     gyro_log: GyroLog | None,
     log: StageLog,
     kept: Kept | None,
+    *,
+    rotates: bool = False,
 ) -> Solved:
-    """The result of a video by these cameras."""
+    """The result of a video by these cameras; `rotates` as in `solve_clip`."""
     solving, cameras = options.solve, keys.cameras
     at_once = solving.shutter_model == "global"
     around_s = 0.0 if options.gyro is None else options.gyro.offset_s
@@ -486,7 +492,7 @@ def _solve_frames(
         solved = solve_clip(
             clip, keys, frame_path(clip, readouts.get(0)), partial(of_registered, wanted, says=False), work, log,
             seed=solving.seed, matching=options.matching, gyroscope=gyro_log, gyro_offset_s=around_s, kept=kept,
-            at_once=at_once,
+            at_once=at_once, rotates=rotates,
         )  # fmt: skip
     registered = of_registered(wanted, solved.shared)  # which names what was left out
     cameras.check_plausible(solved.shared.cameras)

@@ -90,6 +90,7 @@ def solve_clip(
     gyro_offset_s: float = 0.0,
     kept: Kept | None = None,
     at_once: bool = False,
+    rotates: bool = False,
 ) -> Solved:
     """Map the key frames, register all others with their points, and adjust all as moments of one path.
 
@@ -112,6 +113,8 @@ def solve_clip(
         Where the offset of that log's clock is looked for, as `align_gyro` does around it.
     at_once : bool
         Whether the frames were read at once, by a global shutter, or have lost their shutter since.
+    rotates : bool
+        Whether the camera is one that only rotates: no scene is looked for, and there is none if rotations fail.
 
     Returns
     -------
@@ -127,7 +130,7 @@ def solve_clip(
     def along(direction: str) -> tuple[LoadedPhotos, FoundPath]:
         as_stored = direction == keys.cameras.of(0).readout
         read_so = keys if as_stored else replace(keys, cameras=read_along(direction, keys.cameras))
-        return read_so, _filmed_by(clip, read_so, path, options_of, log, telemetry, placed)
+        return read_so, _filmed_by(clip, read_so, path, options_of, log, telemetry, placed, rotates=rotates)
 
     directions = (keys.cameras.of(0).readout,) if at_once else likely_directions(keys.cameras)
     keys, found = _as_read(directions, along, clip.frame_s)
@@ -175,14 +178,17 @@ def _as_read(
 def _filmed_by(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog, telemetry: GyroLog | None, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
+    *, rotates: bool = False,
 ) -> FoundPath:  # fmt: skip
     """The path of the camera: of one that only rotates, through two frames, or of one that travels."""
     rotated, explained = _only_rotated(clip, keys, path, options_of, log)
     if len(clip.names) == 2:
         two = rotated if explained == "by rotations" else None
         return two or _of_two(clip, keys, path, options_of, log)
-    if rotated is not None and rotated.stands:
+    if rotated is not None and (rotated.stands or (rotates and explained == "by rotations")):
         return rotated
+    if rotates:
+        raise ReconstructionError("rotations do not explain the frames")
     direction = keys.cameras.of(0).readout
 
     def read_so() -> tuple[Reconstruction, MatchedPhotos]:
