@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, RowMotion, RsUndistortWarning, RunOptions, project_points
-from rsundistort.batch.progress import StageLog
+from rsundistort import Camera, RowMotion, project_points
 from rsundistort.errors import ReconstructionError
 from rsundistort.input.fisheyes import cameras_as_pinholes
 from rsundistort.input.load import LoadedPhotos
@@ -21,7 +19,7 @@ from rsundistort.model.projection import unproject_points
 from rsundistort.sfm.flow import flow_size
 from rsundistort.solve.clip_pan import rotates_by
 
-MODULE = import_module("rsundistort.solve.run")
+MODULE = import_module("rsundistort.solve.clip_fisheye")
 
 
 def camera_of(f, dist=(), lens="pinhole"):
@@ -50,48 +48,47 @@ def result_of(camera, sigma_px, center_w=TRAVELS, shape="trusted", **evidence):
 
 @pytest.fixture
 def solve(monkeypatch):
-    """`solve_frames` where lenses have these results, one after the other; and the cameras that were asked."""
+    """`by_likeliest_lens` where cameras have these results, one after the other, and say so.
+
+    Returns the result, the cameras that were asked, whether these were to rotate only, what was said, and the notes.
+    """
 
     def solve(*results, rotates=False, cameras=(GUESS,), without_focal=(0,), calibrated=False):
-        asked, left = [], [*results]
+        asked, only, said, left = [], [], [], [*results]
 
-        def solved(_options, _clip, keys, *, rotates=False, **_):
+        def solved(keys, *, kept=None, rotates=False):
             asked.append(keys.cameras.of(0))
-            if rotates:
-                assert asked[-1].lens == "fisheye"
-            if left[0] is None:
-                left.pop(0)
+            only.append(rotates)
+            result = left.pop(0)
+            said.append(f"{len(asked)}")
+            if result is None:
                 raise ReconstructionError("the photos do not determine their camera")
-            warnings.warn(f"by {asked[-1].lens}", RsUndistortWarning, stacklevel=2)
-            return left.pop(0)
+            return result
 
-        monkeypatch.setattr(MODULE, "_solve_frames", solved)
         monkeypatch.setattr(MODULE, "rotates_by", lambda *_: rotates)
         photo_cameras = PhotoCameras(
             cameras, ("clip",), np.zeros(3, int), calibrated, (False,), "the photos", without_focal=without_focal
         )
         keys = LoadedPhotos(["a", "b", "c"], [], [], {}, photo_cameras, {}, Path(), {}, 1.0)
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            found = MODULE.solve_frames(RunOptions(), None, keys, [], None, StageLog(None))
-        return found, asked, [str(each.message) for each in said]
+        found, notes = MODULE.by_likeliest_lens(solved, None, keys, said)
+        return SimpleNamespace(found=found, asked=asked, only=only, said=said, notes=notes)
 
     return solve
 
 
 def test_a_wide_view_is_tried_as_a_fisheyes(solve):
     by_pinhole, by_fisheye = result_of(WIDE, 0.12), result_of(FISHEYE, 0.06)
-    found, asked, said = solve(by_pinhole, by_fisheye)
-    assert found is by_fisheye
-    assert [each.lens for each in asked] == ["pinhole", "fisheye"]
-    assert asked[1].K[0, 0] == 300
-    assert not asked[1].dist.any()
-    assert said[0] == "by fisheye"
-    assert said[1].startswith("no pinhole lens explains the photos of clip, and a fisheye does")
+    got = solve(by_pinhole, by_fisheye)
+    assert got.found is by_fisheye
+    assert [each.lens for each in got.asked] == ["pinhole", "fisheye"]
+    assert got.asked[1].K[0, 0] == 300
+    assert not got.asked[1].dist.any()
+    assert got.said == ["2"]
+    assert got.notes[0].startswith("no pinhole lens explains the photos of clip, and a fisheye does")
     # what it does not explain better stays, with what was said of it
     for failed in (None, result_of(FISHEYE, 0.1199)):
-        found, _, said = solve(by_pinhole, failed)
-        assert (found, said) == (by_pinhole, ["by pinhole"])
+        got = solve(by_pinhole, failed)
+        assert (got.found, got.said, got.notes) == (by_pinhole, ["1"], [])
 
 
 @pytest.mark.parametrize(
@@ -105,27 +102,36 @@ def test_a_wide_view_is_tried_as_a_fisheyes(solve):
     ids=["narrow", "of a known focal length", "given", "stands"],
 )
 def test_other_videos_are_not(solve, found, changes):
-    assert solve(found, **changes) == (found, [GUESS], ["by pinhole"])
+    got = solve(found, **changes)
+    assert (got.found, got.asked, got.said, got.notes) == (found, [GUESS], ["1"], [])
 
 
 @pytest.mark.parametrize(("center_w", "sigma_px"), [(TRAVELS, 0.0401), (ROTATES, 0.03)], ids=["a scene", "rotations"])
 def test_what_rotations_of_a_fisheye_explain_is_tried_as_one(solve, center_w, sigma_px):
     """And a scene that leaves as much is none."""
     by_fisheye, by_pinhole = result_of(FISHEYE, sigma_px, ROTATES), result_of(camera_of(680), 0.04, center_w)
-    found, asked, said = solve(by_pinhole, by_fisheye, by_fisheye, rotates=center_w is TRAVELS)
-    assert found is by_fisheye
-    assert len(said) == 2
-    assert len(asked) == 3  # whether it travelled is asked by that lens again
-    hovers = result_of(FISHEYE, sigma_px, TRAVELS)
-    assert solve(by_pinhole, by_fisheye, hovers, rotates=center_w is TRAVELS)[0] is hovers
-    assert asked[1].K[0, 0] == pytest.approx(np.hypot(640, 360) / np.pi)
+    hovers, rotates = result_of(FISHEYE, sigma_px, TRAVELS), center_w is TRAVELS
+    got = solve(by_pinhole, by_fisheye, hovers, rotates=rotates)
+    assert got.asked[1].K[0, 0] == pytest.approx(np.hypot(640, 360) / np.pi)
+    assert got.only == [False, True, False]  # whether it travelled is asked by that lens then
+    assert (got.found, got.said) == (hovers, ["3"])
+    # what that says is of no concern if it fails
+    got = solve(by_pinhole, by_fisheye, None, rotates=rotates)
+    assert (got.found, got.said, len(got.notes)) == (by_fisheye, ["2"], 1)
     worse = result_of(FISHEYE, 0.042, ROTATES)
-    assert solve(by_pinhole, worse, rotates=center_w is TRAVELS)[0] is by_pinhole
+    assert solve(by_pinhole, worse, rotates=rotates).found is by_pinhole
+
+
+def test_a_wide_view_that_does_not_only_rotate_is_tried_with_its_scene(solve):
+    by_fisheye = result_of(FISHEYE, 0.06)
+    for by_rotations in (None, result_of(FISHEYE, 0.2, ROTATES)):
+        got = solve(result_of(WIDE, 0.12), by_rotations, by_fisheye, rotates=True)
+        assert (got.found, got.only, got.said) == (by_fisheye, [False, True, False], ["3"])
 
 
 def test_an_error_is_one_unless_a_fisheye_can_be_trusted(solve):
     by_fisheye = result_of(FISHEYE, 0.1)
-    assert solve(None, by_fisheye)[0] is by_fisheye
+    assert solve(None, by_fisheye).found is by_fisheye
     for other in (None, result_of(FISHEYE, 0.1, shape="doubtful")):
         with pytest.raises(ReconstructionError, match="do not determine their camera"):
             solve(None, other)
@@ -133,13 +139,11 @@ def test_an_error_is_one_unless_a_fisheye_can_be_trusted(solve):
 
 def test_a_fisheye_that_a_pinhole_lens_follows_is_one(solve):
     by_tangent, by_pinhole = result_of(camera_of(520, TAN, "fisheye"), 0.1), result_of(NARROW, 0.1)
-    found, asked, said = solve(None, by_tangent, by_pinhole)
-    assert found is by_pinhole
-    assert asked[2] == camera_of(520)
-    assert said == ["by pinhole"]
-    found, _, said = solve(None, by_tangent, None)
-    assert found is by_tangent
-    assert len(said) == 2
+    got = solve(None, by_tangent, by_pinhole)
+    assert got.asked[2] == camera_of(520)
+    assert (got.found, got.said, got.notes) == (by_pinhole, ["3"], [])
+    got = solve(None, by_tangent, None)
+    assert (got.found, got.said, len(got.notes)) == (by_tangent, ["2"], 1)
 
 
 @pytest.mark.parametrize(("estimate", "follows"), [(camera_of(520, TAN, "fisheye"), True), (FISHEYE, False)])

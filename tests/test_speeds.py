@@ -158,6 +158,7 @@ def test_errors_of_the_frames_rotations_are_no_vibration(rng, errors):
     R_cw = Rotation.from_rotvec(off).as_matrix() @ R_cw
     found = readouts_by_speed(time_s, np.zeros(60, int), R_cw, sigma, phi + rng.normal(0, NOISE, (60, 3)), sigma, 0.02)
     assert (found.fast is None) == (errors > 0)
+    # errors of frames are at all frequencies: by slow ones, too, they look like a shorter readout time
     assert abs(found.slow.seconds - 0.02) < 0.1 * 0.02
 
 

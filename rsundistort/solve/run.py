@@ -10,15 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
 from ..bundle.intrinsics import check_lenses
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
-from ..input.fisheyes import cameras_as_fisheyes, cameras_as_pinholes
+from ..input.fisheyes import cameras_as_fisheyes
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_readouts
 from ..input.key_frames import Clip
@@ -37,7 +35,7 @@ from ..io.video import VIDEO_SUFFIXES, VideoFrames
 from ..model import Reconstruction, Solution
 from ..model.checks import check_kind
 from ..verdict.judge import unexplained_reasons
-from .clip_pan import rotates_by
+from .clip_fisheye import by_likeliest_lens
 from .going_on import RunFolder, key_of, run_folder
 from .known_contradiction import known_contradiction
 from .model_sequence import solve_photos
@@ -56,7 +54,7 @@ from .run_outputs import (
     photo_times,
     remove_former,
 )
-from .solutions import explains_most, explains_variation, leaves_less, leaves_no_more
+from .solutions import explains_most, explains_variation, leaves_less, needs_other_lens
 from .stretched import cameras_if_stretched
 from .survey import clocks_of, survey_of
 from .tracks import of_registered
@@ -309,7 +307,7 @@ def _is_explained(other: Solved, before: Solved) -> bool:
     """
     fewer = len(other.shared.image_names) < len(before.shared.image_names)
     results = other.result, before.result
-    is_odd = _is_unexplained(before) or before.shared.varies or any(each.field.size for each in before.shared.cameras)
+    is_odd = _is_unexplained(before) or needs_other_lens(before.shared)
     return not fewer and (
         explains_most(*results) or explains_variation(*results) or (not is_odd and leaves_less(*results))
     )
@@ -394,112 +392,34 @@ def solve_frames(
     kept: Kept | None = None,
 ) -> Solved:
     """The result of a video and a gyroscope's log; as of a fisheye, if no pinhole lens explains its frames as well."""
-    solve = partial(_solve_frames, options, clip, bodies=bodies, gyro_log=gyro_log, log=log)
-    found, failed = None, None
-    with _saying() as said:
-
-        def tried(cameras: PhotoCameras, *, rotates: bool = False) -> Solved | None:
-            said.clear()
-            with suppress(ReconstructionError, InputError):
-                return solve(replace(keys, cameras=cameras), kept=None, rotates=rotates)
-            return None
-
-        try:
-            found = solve(keys, kept=kept)
-        except ReconstructionError as error:
-            failed = error
-        before, (apart, rotates) = [*said], _wide_lens(clip, keys.cameras, found)
-        other = None if apart is None else tried(apart[0], rotates=rotates)
-        if apart is not None and other is not None and _fits_better(other, found):
-            if rotates:  # and whether it travelled, too, as what only rotates may look
-                other = tried(apart[0]) or other
-            by_fisheye, pinholes = [*said], cameras_as_pinholes(apart[0], other.shared.cameras)
-            as_pinhole = None if pinholes is None else tried(pinholes)
-            if as_pinhole is not None:
-                return as_pinhole
-            said[:] = by_fisheye
-            for note in apart[1]:
-                warnings.warn(note, RsUndistortWarning, stacklevel=3)
-            return other
-        said[:] = before
-        if failed is not None:
-            raise failed
-    assert found is not None
-    return found
-
-
-def _wide_lens(
-    clip: Clip, cameras: PhotoCameras, found: Solved | None
-) -> tuple[tuple[PhotoCameras, list[str]] | None, bool]:
-    """The camera of a video as a fisheye, where it may be one, as `cameras_as_fisheyes`; and if it is to rotate only.
-
-    A video shows what little a lens leaves, and its path absorbs some: each wide view is tried. Of that, rotations say
-    little, and an error nothing; nor does a scene, if rotations of a fisheye explain it.
-    """
-    wide_view = partial(cameras_as_fisheyes, cameras, doubted=True)
-    if found is None:
-        return wide_view(cameras.cameras, is_unexplained=True), False
-    of_found = found.shared.cameras
-    if found.evidence.get("stands"):  # any lens explains it
-        return None, False
-    if cameras.without_focal:
-        any_view = wide_view(of_found, is_unexplained=True)
-        if any_view is not None and (_only_rotates(found) or rotates_by(clip, any_view[0].of(0))):
-            return any_view, True
-    return wide_view(of_found, is_unexplained=False), False
-
-
-def _fits_better(other: Solved, before: Solved | None) -> bool:
-    """Whether a path through as many frames leaves less, by more than noise may, or no more without any travel.
-
-    Whether it can be trusted, if there is none before it.
-    """
-    if before is None:
-        return other.verdict is not None and other.verdict.shape == "trusted"
-    assert other.whole is not None
-    assert before.whole is not None
-    results = other.result, before.result
-    no_travel = _only_rotates(other) and not _only_rotates(before)
-    fits = leaves_less(*results) or (no_travel and leaves_no_more(*results))
-    return fits and other.whole.num_images >= before.whole.num_images
-
-
-def _only_rotates(solved: Solved) -> bool:
-    """Whether the frames of a video have directions only."""
-    return not np.ptp(solved.shared.center_w, axis=0).any()
-
-
-def _solve_frames(
-    options: RunOptions,
-    clip: Clip,
-    keys: LoadedPhotos,
-    bodies: Sequence[ExifFacts | VideoFrames],
-    gyro_log: GyroLog | None,
-    log: StageLog,
-    kept: Kept | None,
-    *,
-    rotates: bool = False,
-) -> Solved:
-    """The result of a video by these cameras; `rotates` as in `solve_clip`."""
-    solving, cameras = options.solve, keys.cameras
+    solving = options.solve
     at_once = solving.shutter_model == "global"
     around_s = 0.0 if options.gyro is None else options.gyro.offset_s
-    readouts = {} if at_once else known_readouts(
-        bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log
-    )  # fmt: skip
-    wanted = solving.options_for(cameras)
-    with work_folder() as work:
-        solved = solve_clip(
-            clip, keys, frame_path(clip, readouts.get(0)), partial(of_registered, wanted, says=False), work, log,
-            seed=solving.seed, matching=options.matching, gyroscope=gyro_log, gyro_offset_s=around_s, kept=kept,
-            at_once=at_once, rotates=rotates,
+
+    def solve(keys: LoadedPhotos, kept: Kept | None = None, *, rotates: bool = False) -> Solved:
+        cameras = keys.cameras
+        readouts = {} if at_once else known_readouts(
+            bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log
         )  # fmt: skip
-    registered = of_registered(wanted, solved.shared)  # which names what was left out
-    cameras.check_plausible(solved.shared.cameras)
-    for text in cameras.contradicted(solved.shared.cameras, registered):
-        warnings.warn(text, RsUndistortWarning, stacklevel=3)
-    lost = keys.unregistered(solved.shared.image_names)
-    return replace(solved, unregistered=lost, camera_of=keys.camera_of, readouts=readouts)
+        wanted = solving.options_for(cameras)
+        with work_folder() as work:
+            solved = solve_clip(
+                clip, keys, frame_path(clip, readouts.get(0)), partial(of_registered, wanted, says=False), work, log,
+                seed=solving.seed, matching=options.matching, gyroscope=gyro_log, gyro_offset_s=around_s, kept=kept,
+                at_once=at_once, rotates=rotates,
+            )  # fmt: skip
+        registered = of_registered(wanted, solved.shared)  # which names what was left out
+        cameras.check_plausible(solved.shared.cameras)
+        for text in cameras.contradicted(solved.shared.cameras, registered):
+            warnings.warn(text, RsUndistortWarning, stacklevel=3)
+        lost = keys.unregistered(solved.shared.image_names)
+        return replace(solved, unregistered=lost, camera_of=keys.camera_of, readouts=readouts)
+
+    with _saying() as said:
+        solved, notes = by_likeliest_lens(solve, clip, keys, said, kept)
+        for note in notes:
+            warnings.warn(note, RsUndistortWarning, stacklevel=3)
+    return solved
 
 
 def _with_gyroscope(

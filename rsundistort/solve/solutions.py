@@ -21,6 +21,7 @@ __all__ = [
     "explains_variation",
     "leaves_less",
     "leaves_no_more",
+    "needs_other_lens",
     "num_explained",
     "num_of_one_scale",
     "photos_apart",
@@ -102,6 +103,11 @@ def leaves_less(other: BundleResult, before: BundleResult) -> bool:
 def leaves_no_more(other: BundleResult, before: BundleResult) -> bool:
     """Whether one result leaves no more than another, but for what noise may."""
     return bool(other.sigma_px**2 <= (1 + MIN_FALL) * before.sigma_px**2)
+
+
+def needs_other_lens(rec: Reconstruction) -> bool:
+    """Whether photos need more than a lens of the model: one that varies, or a residual field."""
+    return rec.varies or any(camera.field.size for camera in rec.cameras)
 
 
 def explains_variation(other: BundleResult, before: BundleResult) -> bool:

@@ -11,7 +11,7 @@ from ..errors import ReconstructionError
 from ..input.photo_cameras import GUESS_SIGMA, PhotoCameras
 from .outcome import Solved
 from .run_options import SolveOptions
-from .solutions import explains_most, explains_variation, leaves_less
+from .solutions import explains_most, explains_variation, leaves_less, needs_other_lens
 from .tracks import rough_options
 
 __all__ = ["cameras_if_stretched"]
@@ -24,7 +24,7 @@ def cameras_if_stretched(
 
     Square pixels bend stretched photos by what each shows, so that motions and a lens that varies take it up. One
     adjustment with the measurements at hand tells: it has one unknown in place of these. Photos whose pixels are square
-    leave as much with it, to 0.2 %.
+    leave as much with it, but for what noise may.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def cameras_if_stretched(
         Which cameras, for people; None if pixels are square, or the cameras are given.
     """
     rec, given = solved.shared, cameras.sigma or [{}] * len(cameras.cameras)
-    is_odd = is_unexplained or rec.varies or any(camera.field.size for camera in rec.cameras)
+    is_odd = is_unexplained or needs_other_lens(rec)
     if cameras.calibrated or any("fx" in each for each in given):
         return None
     usual = GUESS_SIGMA["f"]
